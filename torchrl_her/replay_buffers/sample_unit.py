@@ -10,7 +10,7 @@ cannot know which transitions it gets, as their index is added after all transfo
 what ``_sample`` returns comes too late for transforms that use the goal. A ``SampleUnit`` gets the index and
 the storage between drawing and reading, under the buffer's lock, and changes neither. The goals that it chose
 are put in by the collate function, which runs before all transforms. So sampler, index and priorities are
-those of the real transitions, and reading (``buffer[:]``) shows real ones.
+those of the real transitions, and the storage (``buffer.storage[:]``) has real ones alone.
 """
 
 from __future__ import annotations

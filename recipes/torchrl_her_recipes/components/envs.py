@@ -3,22 +3,26 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded
 from torchrl.envs import ActionScaling, Compose, EnvBase, Transform, TransformedEnv
 
 from torchrl_her.goals.rewards import EnvReward
+from torchrl_her.trainers.trainer import evaluate
 from torchrl_her_envs.common.goal_env import goal_env, reward_range
 from torchrl_her_envs.registry import GYM, get_task_spec, make_env
 from torchrl_her_recipes.components.failures import Failures
 from torchrl_her_recipes.config.groups import CurriculumConfig, TaskConfig
 from torchrl_her_recipes.config.imports import check_permitted, foreign_module, look_here
 from torchrl_her_recipes.config.recipe import Recipe
+
+Player = Callable[[TensorDictBase], TensorDictBase]
 
 _AT_ONCE = 20  # gymnasium environments in an evaluation, at most: each takes 10 MB or more
 
@@ -32,6 +36,27 @@ def evaluation_envs(task: str, episodes: int) -> int:
     """
     rounds = math.ceil(episodes / _AT_ONCE) if task.startswith(GYM) else 1
     return math.ceil(episodes / rounds)
+
+
+def play_episodes(env: EnvBase, policy: Player, episodes: int, *, runs: int = 1) -> TensorDictBase:
+    """Plays greedy episodes of R runs, in as many rounds as the environments need for them.
+
+    Args:
+        env: R equal blocks of environments.
+        policy: acts in all of them.
+        episodes: number of episodes of each run.
+
+    Keyword Args:
+        runs: R.
+
+    Returns:
+        The rollout [R * episodes, T], run after run.
+    """
+    worlds, max_steps = env.batch_size[0] // runs, goal_env(env).max_steps
+    played = [evaluate(env, policy, max_steps=max_steps) for _ in range(math.ceil(episodes / worlds))]
+    if len(played) == 1:
+        return played[0]
+    return torch.cat([batch.unflatten(0, (runs, worlds)) for batch in played], 1)[:, :episodes].flatten(0, 1)
 
 
 @dataclass(frozen=True)

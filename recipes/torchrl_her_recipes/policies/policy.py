@@ -22,7 +22,7 @@ from torchrl_her.trainers.trainer import evaluate
 from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_recipes.components.agents import find_learner, shape_of
 from torchrl_her_recipes.components.curricula import make_curriculum
-from torchrl_her_recipes.components.envs import TaskEnvs, evaluation_envs, judging
+from torchrl_her_recipes.components.envs import TaskEnvs, evaluation_envs, judging, play_episodes
 from torchrl_her_recipes.config.imports import permit_task
 from torchrl_her_recipes.config.plain_files import naming
 from torchrl_her_recipes.config.policy_header import POLICY_SUFFIX
@@ -222,15 +222,12 @@ class Policy(TensorDictModuleBase):
 
     def measure(self, episodes: int = 1_000, *, seed: int = _MEASURED) -> tuple[float, float]:
         """Returns the shares of episodes whose goal is achieved at the last step, and at some step."""
-        results: list[list[bool]] = []
         with closing(self.envs(evaluation_envs(self.info.task, episodes), seed=seed)) as env:
-            max_steps, judged_by = goal_env(env).max_steps, judging(env)
-            while len(results) < episodes:
-                rollout = evaluate(env, self, max_steps=max_steps)
-                judged = (metric(rollout, **judged_by) for metric in (success, reached))
-                results += torch.stack(tuple(judged), 1).tolist()
-        at_last, at_some = torch.tensor(results[:episodes]).double().mean(0).tolist()
-        return at_last, at_some
+            rollout = play_episodes(env, self, episodes)
+            at_last, at_some = (
+                metric(rollout, **judging(env)).double().mean() for metric in (success, reached)
+            )
+        return float(at_last), float(at_some)
 
     def save(self, path: str | Path, *, card: bool = True) -> None:
         """Writes the policy as a file: for :meth:`load` if its suffix is ``.safetensors``, for onnxruntime if

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
 from torchrl_her import __version__
@@ -17,15 +15,13 @@ from torchrl_her.demonstrations.play import demonstrate
 from torchrl_her_envs.common.goal_env import goal_env, reward_range
 from torchrl_her_envs.registry import GYM
 from torchrl_her_envs.throwing.experts.controller import make_controller
-from torchrl_her_recipes.components.envs import TaskEnvs
+from torchrl_her_recipes.components.envs import Player, TaskEnvs
 from torchrl_her_recipes.config.recipe import make_recipe
 from torchrl_her_recipes.policies.policy import Policy
 
 EXPERT = "expert"
 _AT_ONCE, _OF_GYM_AT_ONCE = 100, 10  # environments that are stepped together
 _MOST = 10  # at most this number of episodes is played for each requested one
-
-Player = Callable[[TensorDictBase], TensorDictBase]
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -12,26 +10,18 @@ from torchrl.envs import EnvBase
 from torchrl_her.curriculum.normalization import restart_inputs
 from torchrl_her.curriculum.switch import enter_stage
 from torchrl_her.trainers.metrics import at_the_end, success
-from torchrl_her.trainers.trainer import evaluate
 from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_recipes.components.assembly import eval_seeds
 from torchrl_her_recipes.components.components import Components
 from torchrl_her_recipes.components.curricula import CurriculumState
-from torchrl_her_recipes.components.envs import judging
+from torchrl_her_recipes.components.envs import judging, play_episodes
 
 
 def play_greedily(components: Components, env: EnvBase, epoch: int) -> TensorDictBase:
     """Plays greedy episodes, run after run, with new starts and goals in each epoch."""
-    task, recipe = goal_env(env), components.recipe
-    runs, episodes = recipe.run.num_runs, recipe.evaluation.episodes
-    task.set_seeds(eval_seeds(recipe.seeds, epoch))
-    worlds = env.batch_size[0] // runs
-    rounds = math.ceil(episodes / worlds)
-    player = components.player
-    played = [evaluate(env, player, max_steps=task.max_steps) for _ in range(rounds)]
-    if rounds == 1:
-        return played[0]
-    return torch.cat([batch.unflatten(0, (runs, worlds)) for batch in played], 1)[:, :episodes].flatten(0, 1)
+    recipe = components.recipe
+    goal_env(env).set_seeds(eval_seeds(recipe.seeds, epoch))
+    return play_episodes(env, components.player, recipe.evaluation.episodes, runs=recipe.run.num_runs)
 
 
 def stage_success(

@@ -175,22 +175,22 @@ def resume(
         raise ValueError("give resume() either options or components that were made with them, not both")
     with home.at_work():
         recipe = home.recipe()
-        state, done = _newest_state(home, keep=recipe.run.keep_checkpoints)
+        state, done, has_buffer = _newest_state(home, keep=recipe.run.keep_checkpoints)
         target = recipe.extended(**options or {}) if components is None else components.recipe
         check_installed(target.run.log)
-        _check_extension(home, target.run, done, has_buffer=bool(state["buffer"]), asked=bool(options))
+        _check_extension(home, target.run, done, has_buffer=has_buffer, asked=bool(options))
         current = _Run(components or build(target), home)
         with torch.random.fork_rng(devices=[]):
             with naming(home.checkpoint, "is not of this run"):
                 load_run_state(current.parts, state)
             if options:
                 home.describe(current.recipe)
-            current.go_back(home, done, has_buffer=bool(state["buffer"]))
+            current.go_back(home, done, has_buffer=has_buffer)
             return current.train(callbacks, progress=progress)
 
 
-def _newest_state(home: RunFolder, *, keep: int) -> tuple[dict[str, Any], int]:
-    """Returns the state in the newest complete checkpoint, and the number of epochs that were done."""
+def _newest_state(home: RunFolder, *, keep: int) -> tuple[dict[str, Any], int, bool]:
+    """Returns the newest complete checkpoint, its number of epochs, and whether it has a replay buffer."""
     try:
         state = load_newest_checkpoint(home.checkpoint, keep=keep)
     except FileNotFoundError:
@@ -198,8 +198,7 @@ def _newest_state(home: RunFolder, *, keep: int) -> tuple[dict[str, Any], int]:
             f"the run in {home.path} cannot be resumed: {home.checkpoint.name} is missing"
         ) from None
     with naming(home.checkpoint, "is not of this run"):
-        _, done = state["buffer"], int(state["trainer"]["epochs"])
-    return state, done
+        return state, int(state["trainer"]["epochs"]), bool(state["buffer"])
 
 
 def _check_extension(
