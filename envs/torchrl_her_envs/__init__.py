@@ -1,7 +1,7 @@
 """Throwing and reaching tasks with goals, toy environments and gymnasium's, batched, for TorchRL.
 
-Names are loaded when they are first used, since listing the tasks must not take the seconds in which
-torch is imported. They are listed in ``__init__.pyi``.
+Names are loaded when they are first used, so that listing the tasks does not take the seconds of importing
+torch. All names are listed in ``__init__.pyi``.
 """
 
 import lazy_loader

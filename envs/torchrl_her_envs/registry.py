@@ -27,14 +27,14 @@ class TaskSpec:
     Args:
         name: name for :func:`make_env`, without a colon.
         summary: one-line description for users.
-        family: the tasks that it belongs to, such as ``"throwing"`` or ``"toy"``.
+        family: group of tasks that it belongs to, such as ``"throwing"`` or ``"toy"``.
         make: the function or class that makes the environment, as ``"module:name"``; it is imported when
             it is first used. It takes ``num_envs``, ``seed``, the arguments and the options.
         arguments: arguments that it is always given, besides the options.
         options: all options that the task takes, with their defaults.
         actions: kind of its actions; None if only its environment can tell.
         takes_others: whether it may take further options, which are only known when it is made.
-        for_pictures: options that let its environments give pictures, if they do not always.
+        for_pictures: options with which its environments give pictures, if they need any.
 
     Example:
         >>> get_task_spec("bit_flip").options
@@ -113,7 +113,7 @@ def module_of(name: str) -> str:
     """Returns the user's module that making a task imports, from the task's name.
 
     Returns:
-        Its name; empty for tasks of this package and for those that gymnasium has registered.
+        The module's name; empty for tasks of this package and for those that gymnasium has registered.
 
     Example:
         >>> module_of("my_module:make_env"), module_of("gym:my_module:MyEnv-v0"), module_of("hand_v0")

@@ -21,20 +21,20 @@ _COUNTERS = ("step", "episode")  # entries of the state that are counters and no
 
 
 class BatchedEnv(GoalEnv):
-    """N environments whose state is a dataclass of tensors with N rows, and a random key for each of them.
+    """N environments: their state is a dataclass of tensors with N rows; each has its own random key.
 
     Subclasses define how episodes start (:meth:`_start_episodes`), what an action does (:meth:`_advance`),
-    what the agent sees (:meth:`_show`) and when a goal is achieved (:meth:`compute_terminated`). All
-    random numbers come from the keys (see ``common.seeding``), so environment k
-    with a given seed does the same in every batch. The reward is 0 where the goal is achieved and -1
-    elsewhere; an achieved goal ends the episode.
+    what the agent observes (:meth:`_show`) and when a goal is achieved (:meth:`compute_terminated`). All
+    random numbers come from the keys (see ``common.seeding``), so environment k with a given seed does the
+    same in every batch. The reward is 0 where the goal is achieved and -1 elsewhere; an achieved goal ends
+    the episode.
 
     Subclasses set ``max_steps`` and ``worlds``, then call :meth:`_make_specs` and
     :meth:`set_seeds`.
 
     Attributes:
-        worlds: the state of all environments, a dataclass of tensors with N rows. Two of them, [N] of
-            int64, are written here: ``step`` counts the steps of the episode, ``episode`` the resets.
+        worlds: the state of all environments, a dataclass of tensors with N rows. This class writes two of
+            them, [N] of int64: ``step`` counts the steps of the episode, ``episode`` the resets.
         max_steps: steps after which an episode is truncated.
         dtype_shown: type of observations, goals and rewards.
 
@@ -107,8 +107,7 @@ class BatchedEnv(GoalEnv):
         """Restores the environments to the state that ``world_state_dict`` returned.
 
         Raises:
-            ValueError: the state is of another number of environments, or of others than these; nothing has
-                changed then.
+            ValueError: the state is of another number or kind of environments; nothing has changed then.
         """
         self._check_state(state)
         entries = {field.name: state[field.name].clone() for field in fields(self.worlds)}
@@ -116,10 +115,10 @@ class BatchedEnv(GoalEnv):
         self._keys = state["key"].numpy().copy().view(np.uint64)
 
     def start_at(self, states: Mapping[str, Tensor], which: Tensor) -> dict[str, Tensor]:
-        """Begins the episodes of some environments at given states, with the goals of these.
+        """Begins episodes of some environments at given states, with the goals that the states have.
 
-        The episodes have all of their steps before them. Seeds, the count of episodes and all other
-        environments stay as they are, so what is drawn later is the same as without this call.
+        The episodes have their full number of steps. Seeds, the count of episodes and all other environments
+        stay as they are, so what is drawn later is the same as without this call.
 
         Args:
             states: M rows of each entry of ``worlds``, as :meth:`world_state_dict` gives them; ``step``,
@@ -127,11 +126,11 @@ class BatchedEnv(GoalEnv):
             which: [M] of int64, the environments, each of them once.
 
         Returns:
-            What all N environments show now: ``state``, ``observation`` and goals.
+            The current ``state``, ``observation`` and goals of all N environments.
 
         Raises:
-            ValueError: an entry is missing or has another shape, or an environment is named twice or is not
-                there; nothing has changed then.
+            ValueError: an entry is missing or has another shape, or an environment is named twice or does not
+                exist; nothing has changed then.
 
         Example:
             >>> import torch
@@ -180,7 +179,7 @@ class BatchedEnv(GoalEnv):
         """Seeds R equal blocks of environments, each as if it were alone.
 
         Args:
-            seeds: R of them.
+            seeds: R seeds.
 
         Raises:
             ValueError: the environments cannot be shared out among R blocks, or a seed is out of range.
@@ -226,7 +225,7 @@ class BatchedEnv(GoalEnv):
         return {**entries, "terminated": terminated, "truncated": truncated, "done": terminated | truncated}
 
     def _pack(self, entries: dict[str, Tensor]) -> TensorDictBase:
-        # With the device that it has anyway: otherwise TorchRL copies every entry.
+        # The device is given although it stays the same: otherwise TorchRL copies every entry.
         options = {"batch_size": self.batch_size, "device": self.device}
         if not self._packed:
             self._packed = True
@@ -243,8 +242,9 @@ class BatchedEnv(GoalEnv):
     def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Begins new episodes where the old ones are over, as ``EnvBase.maybe_reset`` does.
 
-        TorchRL's own takes longer than a step of a hundred environments, and with many of them there is an
-        end in nearly every step. This one writes the new rows and checks nothing: they are known to be right.
+        TorchRL's method takes longer than a step of a hundred environments, and with many environments an
+        episode ends in nearly every step. This method writes the new rows without checks, as they are known
+        to be right.
         """
         done = tensordict.get("done", None)
         if done is None or not all(type(entry) in (Tensor, TensorDict) for entry in tensordict.values()):
@@ -265,9 +265,9 @@ class BatchedEnv(GoalEnv):
         """Sets the specs of observations, actions, rewards and ends.
 
         Args:
-            observed: numbers in an observation.
-            goals: numbers in a goal.
-            seen: the spec of what the agent sees, from its shape.
+            observed: number of entries of an observation.
+            goals: number of coordinates of a goal.
+            seen: makes the spec of a state, an observation or a goal from its shape.
             action: the spec of actions.
         """
         (n,) = self.batch_size

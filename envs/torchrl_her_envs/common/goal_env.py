@@ -18,12 +18,12 @@ from torchrl_her_envs.common.rendering.pictures import captioned
 E = TypeVar("E", bound=EnvBase)
 Box = tuple[list[float], list[float]]  # the least and the greatest coordinates
 Names = str | Sequence[str]  # of an entry that an environment shows, or of several
-INFO = "info"  # the entry of transitions that holds what rewards read besides goals
+INFO = "info"  # the entry of transitions with all that rewards read besides goals
 _HAIR = 1e-6  # width of the bounds of a fixed action, relative to its value
 
 
 class GoalEnv(EnvBase):
-    """Base class of environments with goals: N of them in one batch, besides all that TorchRL's has.
+    """Base class of TorchRL environments with goals, N of them in one batch.
 
     Subclasses set ``max_steps`` and the specs, and say how goals are rewarded and how environments are
     seeded. All other members have defaults to override.
@@ -76,8 +76,8 @@ class GoalEnv(EnvBase):
     def starts_near_goals(self) -> bool:
         """Whether goals lie where episodes start.
 
-        Preferring virtual goals near the real ones, as IBS does, is then of no use: many of them are
-        achieved without doing anything.
+        If so, IBS is of no use: it prefers virtual goals near the real ones, and many of these are achieved
+        without any action.
         """
         return False
 
@@ -104,9 +104,9 @@ class GoalEnv(EnvBase):
 
         Returns:
             For each stage its ``name``; ``observation``, ``achieved_goal`` and ``desired_goal``, which are
-            lists of indices into the state; ``threshold``, how near to the goal is achieved (not in the last
-            stage, whose goals the task judges); and ``instructive``, whether IBS weights apply in it. The
-            state is the observation with the desired goal behind it.
+            lists of indices into the state; ``threshold``, the distance below which a goal is achieved (not
+            in the last stage, which has the task's own reward); and ``instructive``, whether IBS weights
+            apply in it. The state is the observation with the desired goal behind it.
 
         Raises:
             ValueError: the task has no curriculum.
@@ -270,7 +270,7 @@ def choose_indices(count: int, worlds: int | Sequence[int] | None) -> list[int]:
 def bounded_actions(low: Tensor, high: Tensor, count: int) -> Bounded:
     """Makes the spec of actions [count, entries] of float32 from the bounds of one environment, in any shape.
 
-    An entry that is fixed, with ``low`` = ``high``, gets the width of a hair: scaling actions divides by it.
+    A fixed entry, ``low`` = ``high``, gets a tiny width, since scaling actions divides by the width.
 
     Example:
         >>> bounded_actions(torch.tensor([[-1.0, 3.0]]), torch.tensor([[1.0, 3.0]]), 4).shape

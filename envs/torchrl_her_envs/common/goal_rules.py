@@ -66,7 +66,8 @@ class GoalEnds:
             (``"success"``) or the reward of a goal (``"reward"``); ``"never"`` if goals end none; ``"watch"``
             while the environment's own ends count and no rule is set.
         steps: number of steps so far.
-        ended, went_on: steps at achieved goals in which the environment itself ended the episode, or went on.
+        ended, went_on: numbers of steps at achieved goals in which the environment ended or continued the
+            episode.
 
     Example:
         >>> ends = GoalEnds("walk", env_ends=None, tells_success=True)
@@ -95,7 +96,7 @@ class GoalEnds:
         """Sets the rule to the user's choice, or to the one that was found.
 
         Raises:
-            ValueError: the environment lacks what is asked for.
+            ValueError: the environment lacks what the user's choice needs.
         """
         lacks = {"success": not self.tells_success and "info['is_success']"}
         lacks["own"] = self.env_ends is None and "compute_terminated"
@@ -117,7 +118,8 @@ class GoalEnds:
     def found(self) -> Ends | None:
         """Returns the rule that fits the environment's behavior so far; None before it has met a goal.
 
-        Its own function decides if it has one. If not, and it went on at a goal, goals never end an episode.
+        The environment's own function decides if there is one. If not, and an episode continued at its goal,
+        goals never end an episode.
         """
         if self.env_ends is not None:
             return "own" if self.env_ends else "never"
@@ -149,12 +151,12 @@ class GoalEnds:
         """Returns the ends of steps by the rule, and counts what the environment did at achieved goals.
 
         Args:
-            met: bool for each step that achieved their goals.
+            met: bool for each step, whether it achieved its goal.
             terminated, truncated: flags of these steps by the environment.
 
         Returns:
-            ``(terminated, truncated)``. Where goals never end an episode, one that the environment ended at
-            its goal was cut off; ends without the goal are the environment's own.
+            ``(terminated, truncated)``. If goals never end an episode, one that the environment ended at its
+            goal is truncated. Ends without the goal stay as the environment gave them.
         """
         at_goal = terminated & met
         ended, went_on = int(at_goal.sum()), int((met & ~terminated & ~truncated).sum())
@@ -207,12 +209,12 @@ def check_rewards(
         given: the reward from which on a goal counts as achieved, if the user said so.
 
     Returns:
-        The reward of a missed goal (the least one that was seen), the reward of an achieved one (the least
-        one that counts as such), and whether the reward is dense.
+        The reward of a missed goal (the least reward seen), the reward of an achieved goal (the least that
+        counts as achieved), and whether the reward is dense.
 
     Raises:
-        ValueError: equal goals give no more than all others, the reward is dense and ``given`` is None, or
-            ``given`` does not separate equal goals from the least reward.
+        ValueError: equal goals give no higher reward than others, the reward is dense and ``given`` is None,
+            or ``given`` does not separate equal goals from the least reward.
 
     Example:
         >>> check_rewards("walk", 0.0, [-1.0, 0.0, -1.0], None)
@@ -254,7 +256,7 @@ def check_rewards(
 def equal_with_info(name: str, equal: np.ndarray, others: np.ndarray, given: float | None) -> float:
     """Finds the reward of equal goals for :func:`check_rewards`, if rewards depend on infos as well.
 
-    Equal goals are achieved with some infos at least, which random steps may not have met.
+    With infos, equal goals may be achieved only for some infos, which random steps may not have met.
 
     Args:
         name: name of the environment, for the message.
@@ -263,7 +265,7 @@ def equal_with_info(name: str, equal: np.ndarray, others: np.ndarray, given: flo
         given: the reward from which on a goal counts as achieved, if the user said so.
 
     Raises:
-        ValueError: equal goals give no more than others, and ``given`` is None.
+        ValueError: equal goals give no higher reward than others, and ``given`` is None.
 
     Example:
         >>> equal_with_info("walk", np.array([-1.0, 0.0]), np.array([-1.0]), None)
@@ -291,7 +293,7 @@ def is_dense(equal: float, others: Sequence[float] | np.ndarray) -> bool:
 
 
 def _missed(equal: float, others: Sequence[float] | np.ndarray) -> np.ndarray:
-    """Returns the distinct rewards of unequal pairs of goals below that of equal ones, ascending."""
+    """Returns the distinct rewards of other pairs of goals below the reward of equal goals, ascending."""
     rewards = np.unique(np.round(others, _DIGITS) + 0.0)
     return rewards[rewards < equal]
 
@@ -299,7 +301,7 @@ def _missed(equal: float, others: Sequence[float] | np.ndarray) -> np.ndarray:
 def check_same_rewards(name: str, stepped: np.ndarray, computed: np.ndarray) -> str:
     """Returns a warning if rewards of steps [n] differ from those computed for their goals, else nothing.
 
-    Steps in which an episode failed are left out: what that cost is kept in virtual transitions.
+    Steps in which an episode failed are left out, since virtual transitions keep the cost of a failure.
 
     Example:
         >>> check_same_rewards("walk", np.array([-1.0, -1.2]), np.array([-1.0, -1.0]))

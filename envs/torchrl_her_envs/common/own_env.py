@@ -64,10 +64,10 @@ def make_own_env(
 
     Args:
         path: ``"module:name"`` of a function or class that gives a TorchRL ``EnvBase``; the module is
-            imported. If it takes ``num_envs``, it is called with it, and with ``seed`` and ``max_steps`` if
-            it takes them, and must give environments of batch size ``[num_envs]``; for R seeds once, if these
-            have ``set_seeds``, or else R times. If not, it is called ``num_envs`` times, and must give
-            environments without a batch size, which are stepped one after the other.
+            imported. If it takes ``num_envs``, it must give environments of batch size ``[num_envs]``; it
+            also gets ``seed`` and ``max_steps`` if it takes them, and with R seeds is called once if the
+            environments have ``set_seeds``, or else R times. If not, it is called ``num_envs`` times and must
+            give environments without a batch size, which are stepped one after the other.
         num_envs: number of environments.
         seed: seed of all environments; R seeds for R equal blocks of them.
         max_steps: length of an episode; the environment's attribute ``max_steps`` if None.
@@ -83,7 +83,8 @@ def make_own_env(
         :class:`OwnGoalEnv` around them.
 
     Raises:
-        ValueError: there is no such module or name, it gives something else, or lacks what is needed.
+        ValueError: there is no such module or name, it gives no ``EnvBase``, or the environment lacks an
+            entry or a method.
 
     Example:
         >>> env = make_own_env("torchrl_her_envs:BitFlip", num_envs=2, bits=4)
@@ -93,7 +94,7 @@ def make_own_env(
     if num_envs < 1:
         raise ValueError(f"num_envs must be at least 1, got {num_envs}")
     make = _load(path)
-    # A class is asked by its __init__: TorchRL's metaclass would show arguments of its own.
+    # Arguments of a class are those of its __init__, as TorchRL's metaclass adds some of its own.
     signed = make.__init__ if isinstance(make, type) else make  # type: ignore[misc]
     taken = inspect.signature(signed).parameters
     _check_options(path, taken, options)
@@ -127,7 +128,7 @@ def make_own_env(
         if termination not in ("auto", "watch") or achieved_reward is not None or not plain:
             raise ValueError(f"{path} has its own rewards and ends; leave out {', '.join(_OURS[1:])}")
         return envs[0]
-    # A single one is tried, so that what is found out does not depend on how many are asked for.
+    # A single environment is tried, so that the rules found do not depend on the number of environments.
     tried = OwnGoalEnv(
         make_many(1, 0),
         name=path,
@@ -210,9 +211,9 @@ class GoalRules:
 class OwnGoalEnv(GoalEnv):
     """Environments of a user's own as one batch, with seeds, a time limit and ends at goals.
 
-    They show ``observation``, ``achieved_goal`` and ``desired_goal``, vectors each, take a bounded or
-    categorical ``action`` and have a method ``compute_reward(achieved_goal, desired_goal)``, which maps
-    goals [..., g] to rewards [..., 1]. What they may have besides:
+    The environments give vectors ``observation``, ``achieved_goal`` and ``desired_goal``, take a bounded or
+    categorical ``action`` and have a method ``compute_reward(achieved_goal, desired_goal)``, which maps goals
+    [..., g] to rewards [..., 1]. Optional:
 
     - ``compute_terminated(achieved_goal, desired_goal)``, which maps goals [..., g] to bool [..., 1]. If it
       is missing, ``termination`` says what ends an episode at its goal, as for
@@ -231,13 +232,14 @@ class OwnGoalEnv(GoalEnv):
         seed: seed of all environments; R seeds for R equal blocks of them.
         max_steps: length of an episode; the environment's attribute if None.
         termination: rule that ends an episode at its goal.
-        achieved_reward: the reward from which on a goal counts as achieved; that of equal goals if None.
-        rules: rules that were found for another such environment; some steps are tried if None.
+        achieved_reward: the reward from which on a goal counts as achieved; the reward of equal goals if
+            None.
+        rules: rules found for another such environment; None to find them by some steps.
         info_keys: entries of a step that rewards read besides goals.
-        names: its entry, or entries, for observation, achieved and desired goal, where they differ.
+        names: the environment's own names of observation, achieved and desired goal, where they differ.
 
     Attributes:
-        rules: how it rewards and ends.
+        rules: how the environment rewards goals and ends episodes.
         goal_ends: what ends an episode at its goal, and what the environment was seen to do there.
 
     Raises:
@@ -324,14 +326,14 @@ class OwnGoalEnv(GoalEnv):
         """Seeds R equal blocks of environments.
 
         Args:
-            seeds: R of them.
+            seeds: R seeds.
 
         Raises:
             ValueError: the environments cannot be shared out among R blocks, a seed is out of range, or they
                 are batches without ``set_seeds``, and not R of them.
         """
         keys = (block_keys(seeds, self.batch_size[0]) >> np.uint64(33)).tolist()
-        # Many environments seed torch's own generator, which is that of the run.
+        # Many environments seed torch's own generator, which the run uses, too.
         with torch.random.fork_rng(devices=[]):
             if callable(set_seeds := getattr(self._envs[0], "set_seeds", None)) and self._whole:
                 set_seeds(seeds)
@@ -570,7 +572,7 @@ class OwnGoalEnv(GoalEnv):
         stepped = after["reward"].flatten()
         computed = self.compute_reward(achieved, desired, after).flatten()
         reached = computed >= met
-        went_on = ~after["terminated"].flatten() | reached  # what a failure costs is kept
+        went_on = ~after["terminated"].flatten() | reached  # virtual goals keep the cost of failures
         warn_once(check_same_rewards(self._name, stepped[went_on].numpy(), computed[went_on].numpy()))
         first, env_ends = self._envs[0], None
         if callable(getattr(first, "compute_terminated", None)):

@@ -1,7 +1,7 @@
 """Random numbers that depend on nothing but seed, environment and episode.
 
-An environment must start the same whether it runs alone or in a batch of a thousand, and whatever the
-others do. A generator with a state cannot give that; a hash of a counter can.
+An environment must start in the same way alone and in a batch of a thousand, whatever the others do. A
+generator with a state cannot give that; a hash of a counter can.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def block_keys(seeds: Sequence[int], num_envs: int) -> np.ndarray:
     """Returns a key for each environment of a batch of R equal blocks, each as if it were alone.
 
     Args:
-        seeds: R of them.
+        seeds: R seeds.
         num_envs: number of environments in all.
 
     Raises:

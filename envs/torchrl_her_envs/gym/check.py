@@ -31,8 +31,8 @@ _OUR_OPTIONS = (
 )
 EPISODES = 8  # states whose goals the environment's functions are tried with
 _TRIED_STEPS = 100
-_LIMIT_STEPS = 1_000  # that are played to see where an environment truncates an episode itself
-_LIMIT = 100  # length at which other episodes are truncated
+_LIMIT_STEPS = 1_000  # random steps in which an environment may show its own time limit
+_LIMIT = 100  # steps of an episode, if no time limit shows
 _HALVINGS = 30
 _COARSE = 0.05  # steps of float32, relative to the standard deviation of a goal
 _NOISE = 1e-5  # standard deviation of an entry of goals, relative to the largest, below which it is noise
@@ -54,7 +54,7 @@ def make_one(id: str, names: Mapping[str, Names] | None, options: dict[str, Any]
     Args:
         id: id of the environment.
         names: names of its entries, see :func:`~torchrl_her_envs.gym.quiet.make_quietly`.
-        options: for it.
+        options: options of the environment.
 
     Raises:
         ValueError: there is no such environment, or it does not take an option.
@@ -188,7 +188,7 @@ def has_compute_terminated(env: gymnasium.Env, achieved: Any, desired: Any) -> b
 
 
 def goals_to_try(env: gymnasium.Env, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
-    """Collects goals [M, g] of first states: equal pairs, then each achieved with the desired one."""
+    """Collects pairs of goals [M, g] of first states: first equal pairs, then achieved with desired goals."""
     observations = [env.reset(seed=seed)[0] for seed in range(EPISODES)]
     achieved, desired = (np.stack([layout.flatten(obs[key]) for obs in observations]) for key in KEYS[1:])
     pairs = np.repeat(achieved, EPISODES, 0), np.tile(desired, (EPISODES, 1))
@@ -206,8 +206,8 @@ class Trial:
         achieved, desired: [n, g] goals after each step.
         reward: [n] of each step.
         terminated, truncated: [n] of bool, whether the environment ended the episode there.
-        success: [n] of bool, what ``info["is_success"]`` said; None if it was missing in all steps.
-        infos: n of them, as the environment gave them.
+        success: [n] of bool, the value of ``info["is_success"]``; None if it was missing in all steps.
+        infos: n infos, as the environment gave them.
     """
 
     achieved: np.ndarray
@@ -263,7 +263,7 @@ def find_achieved_reward(
     achieved one.
 
     Args:
-        env: with a dense reward.
+        env: environment with a dense reward.
         layout: layout of its goals.
         reward: its reward function.
         achieved, desired: [m, g] goals, most of which are not achieved.

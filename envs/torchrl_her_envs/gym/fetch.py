@@ -11,7 +11,7 @@ from typing import Any
 
 _THRESHOLD = 0.05  # m, as in the environments themselves
 _AROUND = 0.025  # m: open fingers go around a block; closed ones stay 0.038 from its middle
-# What is shown, in order, and how many numbers it has.
+# Entries of an observation, in order, with their widths.
 _GRIPPER = {"grip": 3, "fingers": 2, "grip_speed": 3, "fingers_speed": 2}
 _OBJECT = {
     "grip": 3,
@@ -38,7 +38,7 @@ def fetch_names(id: str) -> dict[str, list[int]]:
     """Returns names for entries of a Fetch task's state; none for another environment.
 
     Args:
-        id: gymnasium's.
+        id: id of the environment in gymnasium.
 
     Example:
         >>> fetch_names("FetchPush-v4")["object"], fetch_names("FetchReach-v4")["place"]
@@ -53,11 +53,11 @@ def fetch_names(id: str) -> dict[str, list[int]]:
 def fetch_stages(id: str) -> list[dict[str, Any]]:
     """Returns the stages of a Fetch task: reach the object, then move it; none for another environment.
 
-    What the first stage wants, the place of the object, is what the second one observes at the same inputs.
-    To reach a point is a single stage. A block that is to be picked up has to be between the fingers.
+    The goal of the first stage, the object's position, is what the second stage observes at the same inputs.
+    Tasks of reaching a point have one stage. A block to be picked up must first be between the fingers.
 
     Args:
-        id: gymnasium's.
+        id: id of the environment in gymnasium.
 
     Example:
         >>> [stage["name"] for stage in fetch_stages("FetchPush-v4")]

@@ -88,22 +88,22 @@ def make_gym_env(
             gymnasium-robotics need no import.
         num_envs: number of environments.
         seed: seed of all environments; R seeds for R equal blocks of them, each as if alone.
-        max_steps: length of an episode. If None, the registered one, or that with which the environment
-            truncates episodes of random actions, or 100.
+        max_steps: length of an episode. If None, the registered length, or the length at which the
+            environment truncates episodes of random actions, or 100.
         parallel: a process for each environment, which pays where a step takes milliseconds and there are
             several cores.
         termination: rule that ends an episode at its goal, see :class:`GymGoalEnv`.
-        achieved_reward: the reward from which on a goal counts as achieved, for dense rewards; if None, that
-            from which on the environment's method ``_is_success`` says so.
+        achieved_reward: the reward from which on a goal counts as achieved, for dense rewards; if None, the
+            least reward at which the environment's method ``_is_success`` is true.
         info_keys: keys of ``info`` that ``compute_reward`` reads, see :class:`GymGoalEnv`.
-        observation_key, achieved_goal_key, desired_goal_key: what it calls these entries; lists of several
-            entries follow each other in their order, and ``compute_reward`` gets dictionaries of them.
+        observation_key, achieved_goal_key, desired_goal_key: the environment's names of these entries. The
+            entries in a list are joined in their order; ``compute_reward`` gets dictionaries of them.
         pictures: whether to make it with ``render_mode="rgb_array"``, if it has that mode.
         options: for the environment, as ``gymnasium.make`` takes them (``render_mode``, for instance).
 
     Raises:
         ValueError: there is no such environment, it does not take an option, it lacks something that GoalEnv
-            asks for, its reward is dense, ``achieved_reward`` is not given and cannot be found, or
+            requires, its reward is dense, ``achieved_reward`` is not given and cannot be found, or
             environments cannot be shared out among the seeds.
         ImportError: a package that it needs is not installed.
 
@@ -135,7 +135,7 @@ def make_gym_env(
             choose_renderer()
             options["render_mode"] = PICTURES
             reference_env = opened.enter_context(closing(make_one(id, names, options)))
-        # By its spec rather than its id: new processes then need neither register it nor load TorchRL.
+        # Made by spec and not by id: new processes then need neither register the id nor load TorchRL.
         make = partial(make_quietly, gymnasium.registry[spec_of(reference_env).id], names, **options)
         vector = AsyncVectorEnv if parallel else SyncVectorEnv
         envs = opened.enter_context(closing(vector([make] * num_envs, autoreset_mode=AutoresetMode.DISABLED)))
@@ -164,34 +164,35 @@ class GymGoalEnv(GoalEnv, GymWrapper):
     ``torchrl_her_envs.gym.layout.Layout`` tells; the environment's own functions get goals in their
     original form.
 
-    What ends an episode at its goal is the environment's ``compute_terminated``. If it has none,
-    ``termination`` says so:
+    The environment's ``compute_terminated`` decides whether a goal ends an episode. If it has none,
+    ``termination`` decides:
 
     - ``"success"``: a step whose ``info["is_success"]`` is true, and virtual goals whose reward is that of
       an achieved goal, since they have no ``info``.
     - ``"reward"``: a real or virtual goal whose reward is that of an achieved goal.
     - ``"never"``: no goal. An episode that the environment ends at its goal is ``truncated``.
-    - ``"auto"``: what 100 steps of random actions show. If the environment ended where a goal was achieved,
-      ``"success"``, or ``"reward"`` if it has no ``is_success``; if it went on, or if no goal was met,
-      ``"never"``. The choice is logged.
-    - ``"watch"``: the environment ends episodes as it does by itself, and ``goal_ends`` tells after any
-      number of steps what it did at goals.
+    - ``"auto"``: found by 100 steps of random actions. If the environment ended where a goal was achieved,
+      ``"success"``, or ``"reward"`` if it has no ``is_success``; if it continued, or if no goal was
+      achieved, ``"never"``. The choice is logged.
+    - ``"watch"``: the environment ends episodes as it does by itself, and ``goal_ends`` counts the episodes
+      that it ended or continued at their goals.
 
-    The first three take the place of ``compute_terminated``, which ``"own"`` asks for. Where the environment
-    ends an episode for another reason, as by a fall, it is ``terminated`` whatever the rule.
+    The first three replace ``compute_terminated``; ``"own"`` keeps it. Where the environment ends an episode
+    for another reason, as by a fall, it is ``terminated`` whatever the rule.
 
     If the environment's functions read more than the goals, ``info_keys`` names the entries of ``info``. They
     become entries of transitions, ``("info", KEY)``, so that virtual ones are rewarded with the info of
     their own step: ``EnvReward(env.compute_reward, env.compute_terminated, info_keys=env.info_keys)``.
 
-    :func:`make_gym_env` makes them.
+    :func:`make_gym_env` makes such environments.
 
     Args:
-        envs: gymnasium's vector of them, which must not reset by itself (``AutoresetMode.DISABLED``).
+        envs: gymnasium's vector of environments, which must not reset by itself (``AutoresetMode.DISABLED``).
         reference_env: another environment of the same kind, whose functions give the rewards of goals.
         seed: seed of all environments; R seeds for R equal blocks of them, each as if alone.
         termination: rule that ends an episode at its goal.
-        achieved_reward: the reward from which on a goal counts as achieved; that of equal goals if None.
+        achieved_reward: the reward from which on a goal counts as achieved; the reward of equal goals if
+            None.
         info_keys: keys of ``info`` that its functions read: numbers, or arrays of numbers, in every step.
 
     Attributes:
@@ -199,7 +200,7 @@ class GymGoalEnv(GoalEnv, GymWrapper):
         achieved_reward: the least reward of an achieved goal.
         missed_reward: the least reward that was seen when the environment was tried; a sparse reward is
             always one of these two.
-        dense_reward: whether there are many others.
+        dense_reward: whether there are many other rewards.
 
     Raises:
         ValueError: environments cannot be shared out among the seeds, an achieved goal gives no more
@@ -260,7 +261,7 @@ class GymGoalEnv(GoalEnv, GymWrapper):
         )
         computed = self._reward_of(trial.achieved, trial.desired, stepped)
         met = computed >= self.achieved_reward
-        went_on = ~trial.terminated | met  # what a failure costs is kept
+        went_on = ~trial.terminated | met  # virtual goals keep the cost of failures
         warn_once(
             self._reward_of.hint(info) or check_same_rewards(id, trial.reward[went_on], computed[went_on])
         )
@@ -316,10 +317,10 @@ class GymGoalEnv(GoalEnv, GymWrapper):
         return fetch_stages(spec_of(self._reference_env).id) or super().stages()
 
     def state_names(self) -> dict[str, list[int]]:
-        """Names for entries of the state: ``observation`` and ``desired_goal``, and what is nested in them.
+        """Names for entries of the state: ``observation``, ``desired_goal``, and entries nested in them.
 
-        That is named with dots between their keys, as in ``observation.arm.angles``. The Fetch tasks have
-        names for more, such as ``object``.
+        Nested entries are named with dots between the keys, as in ``observation.arm.angles``. The Fetch tasks
+        have names for more, such as ``object``.
         """
         names, first = super().state_names() | fetch_names(spec_of(self._reference_env).id), 0
         for key in ("observation", "desired_goal"):
@@ -362,7 +363,7 @@ class GymGoalEnv(GoalEnv, GymWrapper):
         number of the episode alone.
 
         Args:
-            seeds: R of them.
+            seeds: R seeds.
 
         Raises:
             ValueError: the environments cannot be shared out among R blocks, or a seed is out of range.

@@ -38,8 +38,8 @@ class _OneInfo(dict[str, Any]):
 class GoalFunction:
     """``compute_reward`` or ``compute_terminated`` of an environment, for batches of goals.
 
-    Such functions are written for one pair of goals. Many also take batches, and some nothing else, with an
-    info for each row or without. Some answer a batch with one value, which is right only if the answer is
+    Such functions are written for one pair of goals. Many also take batches, and some take batches only, with
+    an info for each row or without. Some answer a batch with one value, which is right only if the answer is
     always the same. Others fail, or mix up the goals of a batch. The constructor finds out which kind a
     function is: it compares the answer to a batch of a few pairs with the answers to each of these pairs.
     Infos have the entries that are given. Those of a batch are one dictionary of arrays, or an array of
@@ -54,12 +54,12 @@ class GoalFunction:
         info: entries [M, ...] of the infos to try it with.
 
     Attributes:
-        form: form of arguments that it takes for one pair of goals: the two goals (``"pair"``), a batch of
-            one (``"rows"``), or a batch of one with an array of infos.
+        form: form in which the function takes one pair of goals: the two goals (``"pair"``), a batch of one
+            (``"rows"``), or a batch of one with an array of infos.
         answers: ``"batch"`` if it takes batches, ``"one"`` if one value answers for all, ``"loop"`` if it
             has to be called pair by pair.
-        tried: [M], its answers to the goals that it was tried with.
-        lacking: keys of infos that it asked for in vain.
+        tried: [M], the function's results for the goals that it was tried with.
+        lacking: keys of infos that the function read but that were missing.
 
     Raises:
         ValueError: it cannot be called with such infos, or does not answer with one number.

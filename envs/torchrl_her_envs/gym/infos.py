@@ -19,7 +19,7 @@ class Infos:
     Args:
         names: names of the entries.
         seen: the infos of some steps, each of which must have all of them.
-        env: its name, for messages.
+        env: name of the environment, for messages.
 
     Raises:
         ValueError: an entry is missing, is no number or array of numbers, or changes its shape.

@@ -26,7 +26,7 @@ class _Leaf:
 
 
 class Layout:
-    """The order of a space's numbers in a row of ``width`` numbers.
+    """The order in which the entries of a space follow each other in a vector of ``width`` numbers.
 
     A vector stays as it is, and a matrix is written row by row. The entries of a dictionary follow each
     other in the alphabetical order of their keys, and so do those of a nested dictionary at its place. The

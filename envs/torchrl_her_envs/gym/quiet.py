@@ -24,8 +24,9 @@ def make_quietly(
 
     Args:
         id: id of the environment.
-        names: its entries, see :class:`~torchrl_her_envs.gym.renamed.RenamedKeys`; None for GoalEnv's.
-        options: for the environment.
+        names: names of its entries, see :class:`~torchrl_her_envs.gym.renamed.RenamedKeys`; None for
+            GoalEnv's.
+        options: options of the environment.
     """
     with _python_alone():
         env = gymnasium.make(id, disable_env_checker=True, **options)

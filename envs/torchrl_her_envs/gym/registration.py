@@ -35,7 +35,7 @@ def register_gym_ids() -> None:
                 max_episode_steps=WorldConfig.max_steps,
                 kwargs={"task": name},
             )
-    # v0, v1 and v2 are tasks beside each other: none of them is out of date, as gymnasium would say.
+    # v0, v1 and v2 are different tasks: gymnasium's warning that v0 and v1 are out of date is wrong.
     warnings.filterwarnings(
         "ignore", rf".*The environment {NAMESPACE}/\w+-v\d is out of date", DeprecationWarning
     )

@@ -16,15 +16,15 @@ if TYPE_CHECKING:
 class RenamedKeys(gymnasium.ObservationWrapper):
     """Shows entries of an environment as ``observation``, ``achieved_goal`` and ``desired_goal``.
 
-    Several entries become a dictionary in the order given. The environment's functions get goals as it shows
-    them: an entry as it is, several as a dictionary under their own names.
+    Several entries become a dictionary in the order given. The environment's functions get goals in the
+    environment's own form: one entry as it is, several as a dictionary under their own names.
 
     Args:
-        env: whose observations are a dictionary.
-        names: its entry, or entries, for each of the three.
+        env: environment whose observations are a dictionary.
+        names: the environment's entry, or entries, for each of the three.
 
     Raises:
-        ValueError: an entry is not shown.
+        ValueError: the environment has no such entry.
     """
 
     def __init__(self, env: gymnasium.Env, names: Mapping[str, Names]) -> None:

@@ -37,7 +37,7 @@ class GoalRules:
             info: not used.
 
         Returns:
-            [...] of float: 0 where they are nearer than the task's threshold, -1 elsewhere.
+            [...] of float: 0 where both goals are nearer than the task's threshold, -1 elsewhere.
         """
         achieved_goal = np.asarray(achieved_goal)
         rewards = reward_of(self._achieved(achieved_goal, desired_goal))
@@ -72,7 +72,7 @@ class GymTask(GoalRules, gymnasium.Env[Observation, np.ndarray]):
         size: side of a picture in pixels.
         world: the constants of the physics; ``max_steps`` among them has no effect.
         num_links: number of links of the arm, for the robot's tasks.
-        threshold: how near to the goal is achieved, in shown coordinates; the task's own if None.
+        threshold: distance below which a goal is achieved, in observed coordinates; the task's own if None.
 
     Raises:
         ValueError: an unknown task or render mode, a number below 1, or a threshold that is not positive.

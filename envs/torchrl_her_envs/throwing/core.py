@@ -1,7 +1,7 @@
 """The throwing tasks on NumPy arrays: motion, catching, observations, goals and ends of episodes.
 
 TorchRL's environments and gymnasium's both take their steps here. On arrays this small a call of NumPy costs
-a tenth of one of torch's, and the state is one matrix, so that a step needs few calls.
+a tenth of a call of torch, and the state is one matrix, so that a step needs few calls.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _HELD_FROM_THE_START = {"held": 1.0, "away": 0.0, "mixed": 0.5}
 class Shown(NamedTuple):
     """Observed entries: ``state`` is the observation [N, ...] with the goal [N, 2] behind it.
 
-    Each is an array of its own, which the caller may keep or change.
+    Each entry is a new array, which the caller may keep or change.
     """
 
     state: np.ndarray
@@ -53,19 +53,19 @@ class ThrowingCore:
     Keyword Args:
         world: the constants of the physics.
         num_links: number of links of the arm, for the robot's tasks.
-        threshold: how near to the goal is achieved, in shown coordinates; the task's own if None.
-        dtype: type of what is shown; the physics is in float64.
+        threshold: distance below which a goal is achieved, in observed coordinates; the task's own if None.
+        dtype: type of observations and goals; the physics is in float64.
 
     Attributes:
         task: the task, see :data:`~torchrl_her_envs.TASKS`.
         world: the constants of the physics.
         effector: the hand or the arm.
-        threshold: how near to the goal is achieved, in shown coordinates.
+        threshold: distance below which a goal is achieved, in observed coordinates.
         fastest_ball: a bound on the speed of the ball, in meters a second.
         achieved_index: positions of the achieved goal in an observation.
         observation_size: number of entries of an observation.
         goal_distribution: distribution of desired goals, in the coordinates that the agent sees.
-        worlds: all that changes: tensors that share memory with the arrays that steps write to.
+        worlds: the state that changes, as tensors that share memory with the arrays that steps write to.
         keys: [N] of uint64, see ``common.seeding``.
 
     Raises:
@@ -127,7 +127,8 @@ class ThrowingCore:
     def _lay_out(self) -> None:
         """Allocates the state: a matrix whose first rows are observed, in meters, radians and seconds.
 
-        A quantity is a row, or several, and a world is a column: so a step has a few long loops.
+        A quantity is a row, or several, and a world is a column, so that a step is a few operations on long
+        rows.
         """
         task, world, joints = self.task, self.world, self.effector.num_joints
         to_screen, to_speed = 2.0 / world.size, 1.0 / world.hand_speed
@@ -145,7 +146,7 @@ class ThrowingCore:
         }
         observed = [*self.effector.shown, *(["ball", "ball_velocity"] if task.throws else []), "goal"]
         hidden = [name for name in _BODIES if name not in observed]
-        if task.effector == "hand":  # its joints are its grip, and are kept there
+        if task.effector == "hand":  # a hand's joints are its grip: the same rows
             hidden = [name for name in hidden if not name.startswith("joint")]
         rows: dict[str, slice] = {}
         end = 0

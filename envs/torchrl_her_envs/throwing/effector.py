@@ -10,14 +10,14 @@ from torchrl_her_envs.throwing.arrays import Array
 class Effector(Protocol):
     """A hand or an arm: pure functions of its joints (for a hand, its position), in meters.
 
-    They take NumPy arrays or tensors and give the same; ``move_one`` and ``grip_one`` do it for the joints
-    of a single one as plain numbers, which is several times as fast as arrays of one.
+    The functions take NumPy arrays or tensors and return the same type. ``move_one`` and ``grip_one`` take
+    the joints of a single world as plain numbers, which is several times as fast as arrays of one.
 
     ``num_joints`` is the number of joints, ``action_speed`` the speed that an action of 1 asks for,
     ``reach`` the box around what the grip can reach: left, bottom, right and top, in fractions of the
-    screen. ``shown`` names what the agent sees of it, in that order: ``cosines`` and ``sines`` (of all
-    joints), ``grip``, ``joint_velocity``, ``grip_velocity``, ``closed``; ``observation_size`` is the number
-    of entries that makes, and ``grip_index`` the two of them that are the grip's position.
+    screen. ``shown`` names the quantities that the agent observes, in that order: ``cosines`` and ``sines``
+    (of all joints), ``grip``, ``joint_velocity``, ``grip_velocity``, ``closed``. ``observation_size`` is the
+    number of their entries, and ``grip_index`` the two entries of the grip's position.
     """
 
     num_joints: int

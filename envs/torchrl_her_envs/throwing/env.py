@@ -41,8 +41,8 @@ class ThrowingEnv(BatchedEnv):
     the joints, then the grip: above 0 it closes), ``reward`` (0 where the goal is achieved, -1
     elsewhere), ``terminated`` (the goal is achieved), ``truncated`` (the last step), ``done``.
 
-    Positions are shown as ``2 * screen - 1``. The environments are independent: environment k with a
-    given seed does the same in every batch, and a partial reset leaves the others as they are.
+    Positions are observed as ``2 * screen - 1``. The environments are independent: environment k with a given
+    seed does the same in every batch, and a partial reset leaves the others as they are.
 
     pymunk computes contacts and bounces only. Free flight is summed in Chipmunk's order, with equal results;
     hand, arm, catching, goals and rewards are array code.
@@ -54,14 +54,14 @@ class ThrowingEnv(BatchedEnv):
             alone.
         world: the constants of the physics.
         num_links: number of links of the arm, for the robot's tasks.
-        threshold: how near to the goal is achieved, in shown coordinates; the task's own if None.
+        threshold: distance below which a goal is achieved, in observed coordinates; the task's own if None.
         dtype: type of observations, goals, actions and rewards, or its name; the physics is in float64.
 
     Attributes:
         task: the task, see :data:`~torchrl_her_envs.TASKS`.
         world: the constants of the physics.
         effector: the hand or the arm.
-        threshold: how near to the goal is achieved, in shown coordinates.
+        threshold: distance below which a goal is achieved, in observed coordinates.
         worlds: the state of all environments, which every step writes to: clone what you want to keep.
 
     Raises:
@@ -143,13 +143,13 @@ class ThrowingEnv(BatchedEnv):
     def stages(self) -> list[dict[str, Any]]:
         """Returns two stages: reach the ball; then throw it into the black hole.
 
-        In the first stage the agent sees the hand or the arm, and wants its grip at the ball. In the second
-        it also sees the ball, at the place in its input where the first stage had its goal, and wants the
-        ball in the black hole. Goals of the first stage lie where episodes start, so IBS weights do not
-        apply to them.
+        In the first stage the agent observes the hand or the arm, and the goal of its grip is the ball. In
+        the second it also observes the ball, at the inputs where the first stage had its goal, and the ball's
+        goal is the black hole. Goals of the first stage lie where episodes start, so IBS weights do not apply
+        to them.
 
         Raises:
-            ValueError: the task has no throw, so reaching is all of it.
+            ValueError: the task has no throw, and reaching has no stages.
         """
         if not self.task.throws:
             raise ValueError(f"{self.task_name} has no curriculum: it has one stage; choose a throwing task")
@@ -176,8 +176,8 @@ class ThrowingEnv(BatchedEnv):
     def state_names(self) -> dict[str, list[int]]:
         """Returns names for entries of the state.
 
-        They are ``hand`` or ``arm`` (all that is seen of it), ``grip`` (where its end is), ``ball`` and, if
-        it is thrown, ``ball_speed`` and ``hole``; besides ``observation`` and ``desired_goal``.
+        They are ``hand`` or ``arm`` (all its observed entries), ``grip`` (position of its end), ``ball`` and,
+        if the ball is thrown, ``ball_speed`` and ``hole``; besides ``observation`` and ``desired_goal``.
         """
         observed = self.effector.observation_size
         names = {self.task.effector: list(range(observed)), "grip": list(self.effector.grip_index)}

@@ -2,8 +2,8 @@
 
 pymunk simulates the balls that may touch something within a step: 3 to 12 % of the steps with random
 actions on the throwing tasks, none on `robot_v1`. Free flight is summed in Chipmunk's order, and is equal
-to its results to the last bit. Only this file imports pymunk; what is held, caught or thrown is decided
-elsewhere.
+to its results to the last bit. Only this file imports pymunk; other files decide which balls are held, caught
+or thrown.
 """
 
 from __future__ import annotations
@@ -37,9 +37,10 @@ class BallPhysics:
     A bounce keeps ``world.bounce`` of the normal speed; along the surface friction slows the ball,
     which slides and never rolls (its moment of inertia is infinite).
 
-    All worlds lie in one place of one space, where balls do not collide with each other. So a ball's path
-    depends on nothing but its own position and velocity, to the last bit, whichever worlds are beside it.
-    Balls that touch nothing within a step need no space: a few sums give what Chipmunk gives.
+    The balls of all worlds are at the same place in one space, and do not collide with each other. So a
+    ball's path depends on nothing but its own position and velocity, to the last bit, whichever worlds are
+    beside it. Balls that touch nothing within a step need no space: a few sums give the same result as
+    Chipmunk.
 
     Args:
         num_worlds: number of worlds, at least 1.
@@ -69,10 +70,10 @@ class BallPhysics:
         Args:
             position: [num_worlds, 2] float64, meters within the world.
             velocity: [num_worlds, 2] float64, meters a second.
-            free: [num_worlds] of bool, which of them move; None for all.
+            free: [num_worlds] of bool, which balls move; None for all.
 
         Returns:
-            The new positions and velocities; those of the other balls as they were.
+            The new positions and velocities; those of all other balls are unchanged.
         """
         balls = np.concatenate((position.numpy().T, velocity.numpy().T))
         self.advance(balls, np.ones(len(position), np.bool_) if free is None else free.numpy())
@@ -84,7 +85,7 @@ class BallPhysics:
 
         Args:
             balls: [4, num_worlds] float64: x, y and their velocities, in meters within the world.
-            free: [num_worlds] of bool, which of them move.
+            free: [num_worlds] of bool, which balls move.
         """
         # A step depends on nothing but the state: if it left a ball unchanged once, it will do so again.
         moves = np.logical_or.reduce(balls != self._settled, 0)
@@ -150,7 +151,7 @@ class _Limits:
     """Coordinates beyond which, or around the wall, a ball may touch something."""
 
     def __init__(self, world: WorldConfig, *, wall: bool) -> None:
-        reach = world.ball_radius * world.size + 2 * _SKIN  # one skin more than needed, whatever the rounding
+        reach = world.ball_radius * world.size + 2 * _SKIN  # one skin more than needed, against rounding
         self._least, self._most = reach, world.size - reach
         self._wall: tuple[float, float, float] | None = None
         if wall:
@@ -229,8 +230,8 @@ class _Space:
         """Adds or removes balls up to the given number, and parks them.
 
         A body keeps its old contacts, and the push that still moves it out of a surface, for one substep
-        more. These cannot be read or written, so all balls spend a substep parked, each by itself and far
-        from everything, before each step: then position and velocity are the whole state of a ball.
+        more. These cannot be read or written. So before each step all balls are parked for a substep, far
+        from everything and from each other: then position and velocity are the whole state of a ball.
         """
         world = self._world
         while len(self._balls) > count:

@@ -1,7 +1,7 @@
 """The time step of a throwing task: who holds the ball, and how hands, arms and balls move.
 
-The rules are written once, for one world in plain numbers as for many in arrays. Numbers are several times as
-fast for one world, arrays for many.
+The same rules serve one world in plain numbers and many worlds in arrays: for one world numbers are several
+times as fast, for many worlds arrays.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from torchrl_her_envs.throwing.tasks import WorldConfig
 class Bodies(NamedTuple):
     """Everything that a step changes: points [2, N], joints [J, N] and flags [N] of bool.
 
-    For one world they are lists of 2 or J numbers, and a bool.
+    For one world, points and joints are lists of 2 and J numbers, and flags are single bools.
     """
 
     joints: Any
@@ -65,7 +65,7 @@ def take_step(now: Bodies, action: Any, closed: Any, kind: Kind, *, catch: float
         action: the speeds of the joints, within [-1, 1]: [J, N], or a list.
         closed: whether the grips close: [N] of bool, or a bool.
         kind: numbers or arrays.
-        catch: how near to a closed grip a ball is caught, in meters.
+        catch: distance from a closed grip within which a ball is caught, in meters.
     """
     held, released = now.held & closed, now.held > closed
     # A released ball keeps the velocity that the hand had in the step before.

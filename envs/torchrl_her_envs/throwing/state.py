@@ -11,8 +11,8 @@ from torch import Tensor
 class WorldState:
     """The state of N environments in meters, radians and seconds. Every tensor has N rows.
 
-    ``free`` says that the ball obeys physics (not while it is held, and the robot's not before it was
-    held for the first time). ``step`` counts the steps of the episode, ``episode`` the resets. The tensors
+    ``free`` says that the ball obeys physics: not while it is held, and in the robot's tasks not before it
+    was held for the first time. ``step`` counts the steps of the episode, ``episode`` the resets. The tensors
     share memory with the arrays that steps write to, so writing to them changes the environments.
     """
 

@@ -31,8 +31,8 @@ class WorldConfig:
     """The constants of the world, in SI units unless a comment says otherwise.
 
     "screen" is a fraction of the side of the square screen, with (0, 0) at the bottom left.
-    Positions are shown to the agent as ``2 * screen - 1``, so from -1 to 1, and speeds as a
-    fraction of ``hand_speed`` (or ``joint_speed``).
+    The agent observes positions as ``2 * screen - 1``, so from -1 to 1, and speeds as a fraction of
+    ``hand_speed`` (or ``joint_speed``).
 
     Raises:
         ValueError: a length, speed, mass or number that is not positive and finite, a number of steps that is
@@ -57,8 +57,8 @@ class WorldConfig:
     max_steps: int = 50  # an episode is 2 s
     hand_speed: float = 8.0  # at most, in each direction: enough to throw across the screen
     joint_speed: float = 4.0  # rad/s, at most
-    ball_radius: float = 0.03  # screen; also how near a hand must be to catch or to have reached
-    hole_radius: float = 0.05  # screen; how near to the goal a ball must be
+    ball_radius: float = 0.03  # screen; also the distance at which a hand catches or has reached it
+    hole_radius: float = 0.05  # screen; distance at which a ball is at the goal
     hand_goals: tuple[float, float, float, float] = (0.55, 0.2, 0.95, 0.8)  # screen: left, bottom, right, top
     arm_goals: tuple[float, float, float, float] = (0.72, 0.2, 0.95, 0.8)  # beyond the arm's reach
     wall_x: float = 0.5  # screen
@@ -90,8 +90,8 @@ class WorldConfig:
     def fastest_ball(self, thrown: float) -> float:
         """Upper bound on the speed of a ball, in meters a second.
 
-        A bounce takes energy from a ball and gives it none, so nothing but the throw and a fall across the
-        whole screen makes it faster.
+        A bounce gives no energy to a ball, so only the throw and a fall across the whole screen make it
+        faster.
 
         Args:
             thrown: the highest speed at which it is thrown, in meters a second.
@@ -105,8 +105,8 @@ class WorldConfig:
     def check_wall(self, fastest: float) -> None:
         """Checks that no ball passes through the wall.
 
-        Contacts are looked for at the end of each substep. A ball that has then passed the middle of the wall
-        is pushed out on the other side, so in one substep it must not move from contact to there.
+        Contacts are found at the end of each substep only. A ball that has then passed the middle of the wall
+        is pushed out on the other side. So it must not move from first contact to the middle in one substep.
 
         Args:
             fastest: the highest speed of a ball, in meters a second.
@@ -153,7 +153,8 @@ class Task:
             for the arm), or ``"mixed"``: held in half of the episodes.
         throws: the goal is a black hole for the ball; otherwise it is the ball, for the effector.
         wall: whether a wall stands in the middle.
-        goal_sigma: how far around a goal others teach it, as a share of the screen: the final sigma of IBS.
+        goal_sigma: distance within which other goals help to learn a goal, as a share of the screen: the
+            final sigma of IBS.
         summary: one-line description for users.
 
     Raises:
@@ -188,7 +189,7 @@ TASKS: dict[str, Task] = {
             effector="hand",
             start="held",
             wall=True,
-            goal_sigma=0.1,  # the wall leaves less around a goal that can be reached
+            goal_sigma=0.1,  # behind the wall, fewer goals around a goal can be reached
             summary="throw a held ball over a wall",
         ),
         Task(

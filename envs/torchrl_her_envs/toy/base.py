@@ -43,13 +43,13 @@ class ToyEnv(BatchedEnv):
     ``terminated`` (the goal is achieved), ``truncated`` (the last step, or an end that says nothing
     about the goal), ``done``.
 
-    Actions are ``Categorical``, [N] of int64, and not one-hot: of several equally good actions TorchRL's
-    ``QValueActor`` then takes the first one, where a one-hot action would have a 1 for each of them;
-    and a replay buffer stores one number a row. ``DQNLoss`` and ``EGreedyModule`` take either form.
+    Actions are ``Categorical``, [N] of int64, and not one-hot. If several actions are equally good, TorchRL's
+    ``QValueActor`` then takes the first one, while a one-hot action would have a 1 for each. A replay buffer
+    also stores just one number a row. ``DQNLoss`` and ``EGreedyModule`` take either form.
 
-    No episode starts at its goal, where no action would be left to take. The environments are
-    independent: environment k with a given seed does the same in every batch, and a partial reset
-    leaves the others as they are.
+    No episode starts at its goal, since it would end without an action. The environments are independent:
+    environment k with a given seed does the same in every batch, and a partial reset leaves the others as
+    they are.
 
     Args:
         goals: distribution of the desired goals.

@@ -18,8 +18,8 @@ class Chain(ToyEnv):
 
     Thesis, appendix C. The agent starts at the first place, its goal is always the last one, and an
     episode has n steps, which suffice without a mistake (premise 4). Action 1 goes forward with
-    probability p (premise 1). Where it fails, and always with action 0, the agent goes back: by one
-    place, or to the first place in the reset-state form. At the first place it stays.
+    probability p (premise 1). If action 1 fails, and always with action 0, the agent goes back: by one place,
+    or to the first place in the reset-state form. At the first place it stays.
 
     Always taking action 1 therefore arrives in one of ``p ** -n`` episodes. With p = 1 an untrained
     policy that goes forward with probability q arrives in one of ``q ** -n``; hindsight lets it

@@ -13,7 +13,7 @@ class LatticeGoals:
 
     Args:
         low: [g], the least coordinates.
-        high: [g], the greatest ones.
+        high: [g], the greatest coordinates.
         count: points along each coordinate; 1 if ``low`` and ``high`` are the same point.
 
     Raises:

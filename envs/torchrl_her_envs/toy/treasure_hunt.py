@@ -22,8 +22,8 @@ class TreasureHunt(ToyEnv):
     transitions that start at their virtual goal: those of a pirate who walks against an end of the line.
 
     Args:
-        step: how far an action goes, in units of the line: a divisor of 100. Treasures lie at multiples
-            of it. The pirate cannot leave the line.
+        step: distance that an action moves the pirate: a divisor of 100. Treasures lie at multiples of it.
+            The pirate cannot leave the line.
 
     Keyword Args:
         max_steps: steps of an episode; 100 / ``step``, which is enough from anywhere, if None.

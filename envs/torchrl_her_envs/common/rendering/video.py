@@ -26,9 +26,9 @@ _SAMPLES = 12  # frames that a GIF's colors are chosen from
 def write_video(frames: Sequence[Tensor], path: str | Path, *, fps: float = 25) -> Path:
     """Writes frames to a video file in the format of its suffix.
 
-    A GIF loops for ever and shares one palette. A run of equal frames in it is stored as one that
-    lasts longer, and its frames last a multiple of 0.01 s. An MP4 (H.264) needs
-    ``pip install ".[video]"``; a side of odd length grows by one pixel in it.
+    A GIF loops for ever and shares one palette. Its frames last a multiple of 0.01 s, and equal frames in a
+    row are stored as one that lasts longer. An MP4 (H.264) needs ``pip install ".[video]"``; a side of odd
+    length grows by one pixel in it.
 
     Args:
         frames: pictures [height, width, 3] of uint8, all of one size.
@@ -60,7 +60,7 @@ def write_video(frames: Sequence[Tensor], path: str | Path, *, fps: float = 25) 
     if fps <= 0:
         raise ValueError(f"fps must be above 0, got {fps}")
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_stem(f"{path.stem}.part")  # so that there is never a video without its end
+    part = path.with_stem(f"{path.stem}.part")  # renamed when complete, so no video lacks its end
     try:
         _WRITERS[suffix](frames, part, fps)
         part.replace(path)
@@ -100,7 +100,7 @@ def _shared_palette(frames: Sequence[Tensor]) -> Image.Image:
     which = torch.linspace(0, len(frames) - 1, min(_SAMPLES, len(frames))).round().long().tolist()
     sample = _image(torch.cat([frames[index] for index in which]))
     counted = sample.getcolors(maxcolors=sample.width * sample.height) or []
-    # Each color counts with the root of its area: otherwise backgrounds take all, and balls turn gray.
+    # A color counts by the root of its area: else backgrounds take the whole palette, and balls turn gray.
     weighted = [color for count, color in counted for _ in range(math.isqrt(count))]
     return _image(torch.tensor([weighted], dtype=torch.uint8)).quantize(_COLORS, Image.Quantize.MEDIANCUT)
 

@@ -47,8 +47,8 @@ class ArmSkill:
         """Returns the next velocity of the joints to swing a ball at the goal, or to get ready to.
 
         A throw is: turn each joint at a constant speed (one of a grid) for some steps, let go, fly. The
-        quickest is taken; where none works from here, the arm turns to where all goals can be thrown at. No
-        plan is kept: one step later the same throw is still there, a step shorter.
+        quickest throw is taken; if none works from here, the arm turns to where it can throw at all goals.
+        No plan is kept, since one step later the same throw is still possible, a step shorter.
 
         Returns:
             [B, 2] in radians a second; more than the arm's speed where it has to turn farther than one step.
@@ -73,7 +73,7 @@ class ArmSkill:
 def _swings(joints: Tensor, arm: Effector, world: WorldConfig) -> tuple[Tensor, Tensor, Tensor]:
     """Returns constant speeds of the joints [speeds, 2], and the ball's positions after 1, 2, ... steps.
 
-    That is its position and its velocity, each [B, speeds, steps, 2].
+    The ball's positions and velocities are [B, speeds, steps, 2] each.
     """
     line = torch.linspace(-arm.action_speed, arm.action_speed, _SPEEDS)
     speeds = torch.cartesian_prod(*[line] * arm.num_joints)

@@ -1,8 +1,8 @@
 """Throws, and the free flight of a ball. Pure functions, any batch shape.
 
-They follow the steps of the physics, not the parabola: in each substep h a ball moves on by v h and is
-slowed by g h afterwards, so that after m substeps it has fallen by g h^2 m (m - 1) / 2. Points and
-velocities are [..., 2] in meters and meters a second.
+The functions follow the steps of the physics, not the parabola: in each substep h a ball moves by v h and is
+then slowed by g h, so that after m substeps it has fallen by g h^2 m (m - 1) / 2. Points and velocities are
+[..., 2] in meters and meters a second.
 """
 
 from __future__ import annotations

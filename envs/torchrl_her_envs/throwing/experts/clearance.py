@@ -73,7 +73,7 @@ def will_hit(
         velocity: [..., 2], of the ball.
         goal: [..., 2].
         world: the constants of the world.
-        wall: whether there is one.
+        wall: whether there is a wall.
         within: how near to the goal, in meters, the ball must be at the end of a time step.
 
     Returns:

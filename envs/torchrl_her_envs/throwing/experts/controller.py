@@ -18,9 +18,9 @@ from torchrl_her_envs.throwing.experts.clearance import will_hit
 from torchrl_her_envs.throwing.experts.hand import HandSkill
 from torchrl_her_envs.throwing.tasks import Task, WorldConfig
 
-_CHUNK = 16  # throws planned at once: each compares thousands, and all should fit into the processor's cache
+_CHUNK = 16  # plans made at once: each compares thousands of throws, and all should fit into the cache
 _PLANNED = 0.8  # share of the threshold by which a planned throw may miss the goal ...
-_LET_GO = 0.9  # ... and one that is let go: a little more, so that rounding never spoils a plan
+_LET_GO = 0.9  # ... and a throw on release: a little more, so that rounding never spoils a plan
 
 
 class Skill(Protocol):
@@ -55,15 +55,14 @@ class _Seen:
 class Controller(TensorDictModuleBase):
     """A policy that reaches for the ball, closes, carries, and lets go when the ball will fly into the goal.
 
-    It reads nothing but the ``state`` that the agent is shown (observation and goal), and keeps nothing from
-    one step to the next. So it need not be told of new episodes, and takes recorded states of any batch
-    shape.
+    It reads nothing but the ``state`` that the agent observes (observation and goal), and has no memory from
+    one step to the next. So it needs no reset between episodes, and takes recorded states of any batch shape.
 
     Args:
         task: the task, see :data:`~torchrl_her_envs.TASKS`.
         world: the constants of the world.
-        threshold: how near to the goal is achieved, in shown coordinates; the task's if None. Far below
-            that the arm may find no throw, since it tries a grid of them.
+        threshold: distance below which a goal is achieved, in observed coordinates; the task's if None. With
+            far smaller ones the arm may find no throw, since it tries a grid of throws.
         num_links: number of links of the arm, for the robot's tasks.
 
     Raises:

@@ -11,7 +11,7 @@ from torchrl_her_envs.throwing.experts.clearance import clears_ceiling, clears_w
 from torchrl_her_envs.throwing.hand import Hand
 from torchrl_her_envs.throwing.tasks import WorldConfig
 
-_PLACES = (11, 10)  # columns and rows of places to throw from; columns count for goals close behind the wall
+_PLACES = (11, 10)  # columns and rows of places to throw from; many columns help with goals behind the wall
 
 
 class HandSkill:
@@ -36,12 +36,12 @@ class HandSkill:
         """Returns the next velocity to carry a ball to where it can be thrown, or to throw it.
 
         A throw is: move to a place (one of a grid, or just here), swing for one step with the velocity of
-        :func:`~.ballistics.throw_velocity`, let go, fly. The quickest is taken. No plan is
-        kept: one step later the same throw is still there, a step shorter.
+        :func:`~.ballistics.throw_velocity`, let go, fly. The quickest throw is taken. No plan is kept, since
+        one step later the same throw is still possible, a step shorter.
 
         Returns:
             [B, 2] in meters a second; more than the hand's speed where the place is farther than one step.
-            Where no throw works it means nothing.
+            If no throw works, the velocity is meaningless.
 
         Example:
             >>> hand, goal = HandSkill(WorldConfig(), wall=False), torch.tensor([[4.0, 2.5]])
@@ -79,7 +79,7 @@ def _steps_to(gap: Tensor, stride: float) -> Tensor:
     """Returns the steps that a hand needs for a way [..., 2], at up to a stride a step in each direction."""
     return (
         gap.abs().amax(-1) / stride - 1e-3
-    ).ceil()  # rounding: a thousandth of a stride away counts as arrived
+    ).ceil()  # a thousandth of a stride, as by rounding, counts as arrived
 
 
 def _can_throw(start: Tensor, velocity: Tensor, hand: Effector, world: WorldConfig, *, wall: bool) -> Tensor:

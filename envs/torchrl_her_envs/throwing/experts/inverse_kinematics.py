@@ -48,7 +48,7 @@ def nearest_turn(joints: Tensor, point: Tensor, base: Tensor, length: float) -> 
 
     Args:
         joints: [..., 2], the angles now.
-        point: [..., 2], where to.
+        point: [..., 2], where the end shall be.
         base: [2], position of the first joint.
         length: total length of the two links.
 
