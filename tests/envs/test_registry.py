@@ -138,18 +138,6 @@ def test_options_that_a_task_does_not_take(name: str, option: str, allowed: str)
         make_env(name, **{option: 1})
 
 
-@pytest.mark.parametrize(
-    ("name", "options", "message"),
-    [
-        ("bit_flip", {"bits": 2.5}, "bits must be a whole number from 1 to 127, got 2.5"),
-        ("hand_v0", {"threshold": -1}, "threshold must be positive, got -1"),
-    ],
-)
-def test_options_out_of_their_range(name: str, options: dict[str, object], message: str) -> None:
-    with pytest.raises(ValueError, match=f"^{message}$"):
-        make_env(name, **options)
-
-
 # Names that there are not
 
 
@@ -175,12 +163,6 @@ def test_nothing_is_suggested_where_nothing_is_near(name: str) -> None:
     tasks = f"the tasks are {LISTED}, {OTHERS}"
     with pytest.raises(ValueError, match=f"^unknown task '{name}'; {tasks}$"):
         check_task(name)
-
-
-def test_ids_that_gymnasium_does_not_know_are_found_out_when_the_environment_is_made() -> None:
-    check_task("gym:tests/Wlak-v0")
-    with pytest.raises(ValueError, match="cannot make .* 'tests/Wlak-v0'"):
-        make_env("gym:tests/Wlak-v0")
 
 
 # Tasks of one's own

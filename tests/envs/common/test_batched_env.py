@@ -97,13 +97,6 @@ def test_ends_and_rewards() -> None:
     assert env.worlds.step.tolist() == [4] * 3
 
 
-def test_rewards_are_zero_where_the_goal_is_achieved() -> None:
-    achieved, desired = torch.tensor([[1.0], [2.0]], dtype=torch.float64), torch.tensor([2.0])
-    reward = Counting().compute_reward(achieved, desired)
-    assert reward.tolist() == [[-1.0], [0.0]]
-    assert reward.dtype == torch.float64
-
-
 def test_a_reset_with_a_mask_starts_those_alone() -> None:
     env = Counting(4, seed=(3,))
     shown = env.reset()
@@ -155,14 +148,6 @@ def test_maybe_reset_does_nothing_before_an_end() -> None:
     assert env.started == [[0, 1]]
 
 
-def test_a_state_of_another_number_of_environments_is_refused() -> None:
-    env, other = Counting(4), Counting(1)
-    for each in (env, other):
-        each.reset()
-    with pytest.raises(ValueError, match="the state must be of 4 environments, got '.*' of 1"):
-        env.load_world_state_dict(other.world_state_dict())
-
-
 def test_resuming_and_seeding() -> None:
     env, other = Counting(6, seed=(3, 5)), Counting(6, seed=(9,))
     env.reset()
@@ -192,15 +177,6 @@ def test_what_a_subclass_must_say() -> None:
 
     with pytest.raises(TypeError, match="abstract"):
         Empty(1)
-
-
-def test_what_is_shown_must_have_a_row_for_each_environment() -> None:
-    class Odd(Counting):
-        def _show(self) -> dict[str, Tensor]:
-            return {key: own[:1] for key, own in super()._show().items()}
-
-    with pytest.raises(RuntimeError, match="batch"):
-        Odd(3).reset()
 
 
 def test_episodes_start_at_given_states_and_the_others_go_on() -> None:

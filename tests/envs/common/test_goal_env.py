@@ -7,10 +7,10 @@ import torch
 from torchrl.envs import StepCounter, TransformedEnv
 from torchrl.envs.libs.gym import GymEnv
 
-from torchrl_her_envs import GoalEnv, goal_env, make_env, reward_range, task_names
+from torchrl_her_envs import GoalEnv, goal_env, make_env, task_names
 from torchrl_her_envs.common.goal_env import choose_indices
 
-from ..gym.walk import WALK, walk
+from ..gym.walk import WALK
 
 EVERY = [*task_names(), f"gym:{WALK}"]
 
@@ -137,11 +137,6 @@ def test_defaults_of_an_environment_that_says_nothing() -> None:
         silent.stages()
     with pytest.raises(ValueError, match="Silent gives no pictures"):
         silent.render()
-
-
-def test_rewards_of_missed_and_achieved_goals() -> None:
-    assert reward_range(make_env("chain")) == (-1.0, 0.0)
-    assert reward_range(walk()) in {(-1.0, 0.0), (-2.0, 0.0)}
 
 
 @pytest.mark.parametrize(

@@ -66,9 +66,7 @@ def test_seeds_give_each_environment_the_same_in_every_batch_and_leave_torch_alo
     assert torch.equal(torch.rand(1), expected)
 
 
-def test_a_function_is_given_each_seed_as_a_number(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_function_is_given_each_seed_as_a_number(monkeypatch: pytest.MonkeyPatch) -> None:
     points, seen = importlib.import_module(HERE), []
 
     def make_seeded(num_envs: int, seed: Any) -> Any:
@@ -115,12 +113,8 @@ def test_actions_have_the_shape_and_type_of_their_spec_and_fixed_ones_stay() -> 
 
 
 def test_what_it_does_at_a_goal_does_not_depend_on_how_many_there_are() -> None:
-    found = {
-        make_own_env(f"{HERE}:Point", num_envs=n, goes_on=goes_on).ends
-        for n in (1, 5, 40)
-        for goes_on in (True,)
-    }
-    assert found == {"never"}
+    for n in (1, 5, 40):
+        assert make_own_env(f"{HERE}:Point", num_envs=n, goes_on=True).ends == "never"
 
 
 def test_a_complete_goal_environment_is_taken_as_it_is() -> None:

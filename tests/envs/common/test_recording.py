@@ -6,7 +6,6 @@ import pytest
 import torch
 from tensordict import TensorDictBase
 from torchrl.envs import StepCounter, TransformedEnv
-from torchrl.envs.libs.gym import GymEnv
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from torchrl_her_envs import ThrowingEnv, WorldConfig, make_env, record_episodes
@@ -45,15 +44,12 @@ def corner(frame: torch.Tensor, world: int) -> tuple[int, ...]:
     return tuple(frame[world // 2 * SIZE, world % 2 * SIZE].tolist())
 
 
-def test_a_frame_for_the_start_and_each_step_and_the_last_is_held(env):
+def test_a_frame_for_the_start_and_each_step_and_the_last_is_held_for_a_second_unless_told(env):
+    assert len(record_episodes(env, Still(), size=SIZE)) == 1 + 5 + 25
     frames = record_episodes(env, Still(), size=SIZE, hold=3)
     assert len(frames) == 1 + 5 + 3
     assert all(frame.shape == (2 * SIZE, 2 * SIZE, 3) for frame in frames)
     assert all(frame.equal(frames[-1]) for frame in frames[-4:])
-
-
-def test_the_last_frame_is_held_for_a_second_unless_told(env):
-    assert len(record_episodes(env, Still(), size=SIZE)) == 1 + 5 + 25
 
 
 def test_a_failed_episode_gets_a_red_border_at_its_end(env):
@@ -188,8 +184,3 @@ def test_a_caption_is_in_films_of_any_environment():
 def test_what_gives_no_pictures_cannot_be_filmed():
     with pytest.raises(ValueError, match="gym:tests/Walk-v0 cannot be filmed: it gives no pictures"):
         record_episodes(walk(), Still())
-
-
-def test_there_must_be_an_environment_with_goals():
-    with pytest.raises(TypeError, match="expected an environment with goals, got GymEnv"):
-        record_episodes(GymEnv("CartPole-v1"), Still())

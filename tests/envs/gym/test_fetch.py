@@ -90,12 +90,6 @@ def test_other_environments_have_none(id: str) -> None:
     assert fetch_names(id) == {}
 
 
-@pytest.mark.parametrize("env", ["torchrl_her_envs:torchrl_her/HandReach-v0"], indirect=True)
-def test_they_say_so(env: GymGoalEnv) -> None:
-    with pytest.raises(ValueError, match="has no curriculum: give its stages as curriculum=FILE.yaml"):
-        env.stages()
-
-
 @pytest.mark.parametrize("suffix", [".gif", ".mp4"])
 def test_films_without_a_display(suffix: str, tmp_path: Path) -> None:
     pytest.importorskip("gymnasium_robotics")

@@ -63,14 +63,6 @@ def test_counted_actions_are_whole_numbers_one_for_each_environment() -> None:
     assert torch.equal(after, (before + torch.tensor([[-1.0], [1.0], [1.0]])).clamp(0, LAST))
 
 
-def test_continuous_actions_keep_their_bounds() -> None:
-    env = walk(3, actions=spaces.Box(np.float32([-2.0, 0.0]), np.float32([3.0, 0.5])))
-    assert isinstance(env.action_spec, Bounded)
-    assert env.action_spec_unbatched.low.tolist() == [-2.0, 0.0]
-    assert env.action_spec_unbatched.high.tolist() == [3.0, 0.5]
-    assert rollout(env)["action"].shape == (3, 40, 2)
-
-
 @pytest.mark.parametrize(
     "actions",
     [
@@ -165,13 +157,6 @@ def test_an_end_at_the_goal_is_terminated_and_one_out_of_time_is_truncated() -> 
         step[now["done"].squeeze(-1)] = 0
     assert after["terminated"].any()
     assert (after["truncated"] & ~after["terminated"]).any()
-
-
-def test_environments_that_never_terminate_run_into_their_time_limit() -> None:
-    after = rollout(walk(3, ends=False), 12)["next"]
-    assert not after["terminated"].any()
-    assert after["truncated"].nonzero()[:, 1].tolist() == [5, 11] * 3
-    assert (after["reward"] == 0).any()
 
 
 def test_only_environments_that_are_done_begin_anew() -> None:
@@ -407,19 +392,6 @@ def test_pictures_of_other_processes() -> None:
     same.reset()
     assert torch.equal(env.render([2, 0]), same.render([2, 0]))
     env.close()
-
-
-def test_what_it_says_of_its_task() -> None:
-    env = walk()
-    assert (env.task_name, env.goal_box(), env.regions(), env.starts_near_goals) == (
-        f"gym:{WALK}",
-        None,
-        {},
-        False,
-    )
-    assert env.goal_sigma == 0.2
-    with pytest.raises(ValueError, match=f"gym:{WALK} has no curriculum: give its stages"):
-        env.stages()
 
 
 # gymnasium-robotics

@@ -101,21 +101,6 @@ def test_functions_of_goals_broadcast(one: tuple[int, ...], other: tuple[int, ..
         assert function(np.zeros(one), np.zeros(other), {}).shape == shape
 
 
-def test_the_reward_is_that_of_the_goals_shown() -> None:
-    env = make("hand_v0", threshold=0.5).unwrapped
-    rewards = set()
-    for seed in range(20):
-        env.reset(seed=seed)
-        env.action_space.seed(seed)
-        for _ in range(30):
-            shown, reward, terminated, _, info = env.step(env.action_space.sample())
-            goals = shown["achieved_goal"], shown["desired_goal"], info
-            assert reward == env.compute_reward(*goals)
-            assert terminated == env.compute_terminated(*goals)
-            rewards.add(reward)
-    assert rewards == {0.0, -1.0}
-
-
 @pytest.mark.parametrize(
     ("options", "length"), [({}, 50), ({"max_episode_steps": 7}, 7), ({"max_episode_steps": 70}, 70)]
 )
@@ -177,13 +162,6 @@ def test_arms_at_full_speed_stay_within_what_the_space_says(links: int) -> None:
 def test_options_that_cannot_be(options: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make(**options)
-
-
-def test_actions_that_are_no_numbers_are_refused() -> None:
-    env = make(disable_env_checker=True)
-    env.reset(seed=0)
-    with pytest.raises(ValueError, match="actions must be finite"):
-        env.step(np.array([0.0, np.nan, 0.0], np.float32))
 
 
 # Pictures

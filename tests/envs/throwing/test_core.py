@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from torchrl_her_envs import WorldConfig, get_task
+from torchrl_her_envs import get_task
 from torchrl_her_envs.throwing.core import ThrowingCore
 
 
@@ -61,33 +61,3 @@ def test_actions_that_cannot_be_move_nothing(num_envs: int, action: list[float],
         core.advance(actions)
     assert np.array_equal(core.show().state, before)
     assert not core.worlds.step.any()
-
-
-def test_goals_are_compared_in_any_shape() -> None:
-    core = make(threshold=0.5)
-    achieved = np.array([[[0.0, 0.0]], [[0.4, 0.4]]])
-    desired = np.array([[0.3, 0.3], [1.0, 1.0], [0.0, 0.1]])
-    expected = np.linalg.norm(achieved - desired, axis=-1) < 0.5
-    assert np.array_equal(core.achieved(achieved, desired), expected)
-    assert core.achieved(desired[0], desired[2]) == (np.hypot(0.3, 0.2) < 0.5)
-
-
-def test_time_runs_out() -> None:
-    core = make(world=WorldConfig(max_steps=3))
-    for step in range(1, 4):
-        core.advance(np.zeros((5, 3)))
-        assert core.out_of_time().tolist() == [step == 3] * 5
-    core.begin(np.array([1]))
-    assert core.out_of_time().tolist() == [True, False, True, True, True]
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"num_envs": 0}, "num_envs must be at least 1, got 0"),
-        ({"threshold": 0.0}, "threshold must be positive, got 0.0"),
-    ],
-)
-def test_options_that_cannot_be(options: dict[str, float], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        make(**options)

@@ -87,15 +87,6 @@ def test_the_same_seed_repeats_bit_for_bit(name: str) -> None:
     assert (collect(one, actions) == collect(same, actions)).all()
 
 
-def test_set_seed_starts_over() -> None:
-    env, fresh = make("hand_v2", 8, seed=1), make("hand_v2", 8, seed=5)
-    actions = random_actions(env, 60)
-    collect(env, actions)
-    env.set_seed(5)
-    fresh.set_seed(5)
-    assert (collect(env, actions) == collect(fresh, actions)).all()
-
-
 def test_seeds_environments_and_episodes_all_start_differently() -> None:
     starts = []
     for seed in (0, 1, 2):

@@ -46,14 +46,6 @@ def test_specs_of_other_arms(name: str, links: int) -> None:
     check_env_specs(make_env(name, num_envs=2, num_links=links), seed=0)
 
 
-def test_a_rollout_stops_at_the_first_end() -> None:
-    torch.manual_seed(0)
-    steps = make_env("hand_v1", num_envs=4).rollout(1000)
-    assert steps.batch_size == (4, 50)
-    assert steps["next", "done"][:, -1].any()
-    assert not steps["next", "done"][:, :-1].any()
-
-
 def test_a_rollout_goes_on_over_ends() -> None:
     torch.manual_seed(0)
     steps = make_env("robot_v1", num_envs=4, seed=1).rollout(120, break_when_any_done=False)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from torchrl_her_envs import TASKS, WorldConfig, make_env
+from torchrl_her_envs import TASKS, make_env
 
 THROWS = [name for name, task in TASKS.items() if task.throws]
 REACHES = [name for name, task in TASKS.items() if not task.throws]
@@ -103,7 +103,3 @@ def test_a_type_may_be_given_by_name(dtype: torch.dtype | str) -> None:
 def test_types_that_hold_no_fractions_are_refused(dtype: object) -> None:
     with pytest.raises(ValueError, match=f"dtype must be a floating-point type .* got {dtype!r}"):
         make_env("hand_v0", dtype=dtype)
-
-
-def test_episodes_are_as_long_as_the_constants_say() -> None:
-    assert make_env("hand_v0", world=WorldConfig(max_steps=7)).max_steps == 7

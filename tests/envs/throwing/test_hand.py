@@ -35,11 +35,6 @@ def test_moves_within_its_half(change: list[float], to: list[float]) -> None:
     torch.testing.assert_close(hand.move(points([1.0, 3.0]), points(change)), points(to))
 
 
-def test_stays_clear_of_the_wall() -> None:
-    hand = Hand(WorldConfig(), wall=True)
-    torch.testing.assert_close(hand.move(points([2.7, 3.0]), points([0.5, 0.0])), points([2.76, 3.0]))
-
-
 def test_is_its_own_grip() -> None:
     hand = Hand(WorldConfig(), wall=False)
     assert torch.equal(hand.grip(points([1.0, 2.0])), points([1.0, 2.0]))

@@ -8,7 +8,6 @@ import pytest
 from torchrl_her_envs import TASKS, get_task
 from torchrl_her_envs.throwing import core as core_module
 from torchrl_her_envs.throwing.core import ThrowingCore
-from torchrl_her_envs.throwing.rules import reward_of
 
 
 def play(task: str, *, steps: int = 160, num_links: int = 2) -> np.ndarray:
@@ -59,8 +58,3 @@ def test_a_released_ball_has_the_velocity_of_the_grip(few: int, monkeypatch: pyt
     core.worlds.grip_velocity[:] = core.worlds.grip.new_tensor([3.0, 2.0])
     core.advance(np.array([[1.0, 1.0, -1.0]] * 2))
     np.testing.assert_allclose(core.worlds.ball_velocity.numpy(), [[3.0, 2.0 - 0.4]] * 2, atol=1e-12)
-
-
-def test_rewards() -> None:
-    assert (reward_of(True), reward_of(False)) == (0.0, -1.0)
-    assert reward_of(np.array([[True], [False]])).tolist() == [[0.0], [-1.0]]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 
-import pytest
 import torch
 
 from torchrl_her_envs import Arm, WorldConfig
@@ -35,8 +34,3 @@ def test_a_skill_reads_its_angles_and_reaches_in_one_step() -> None:
     near = arm.grip(torch.tensor([[0.6, -1.9]]))
     velocity = skill.reach(angles, near)
     torch.testing.assert_close(arm.grip(angles + velocity * WORLD.time_step), near, atol=1e-4, rtol=0)
-
-
-def test_it_needs_two_links() -> None:
-    with pytest.raises(ValueError, match="an arm of 2 links, got num_links=3"):
-        ArmSkill(WORLD, num_links=3)

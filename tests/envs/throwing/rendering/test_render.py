@@ -68,13 +68,6 @@ def test_the_method_draws_the_first_environment_at_300_pixels():
     assert env.render().equal(render(env, 0, size=300))
 
 
-@pytest.mark.parametrize("worlds", [3, -1, [0, 3], []])
-def test_environments_that_do_not_exist(worlds):
-    env = make_env("hand_v1", num_envs=3)
-    with pytest.raises(ValueError, match="worlds must be one or more indices from 0 to 2, got"):
-        render(env, worlds)
-
-
 def test_a_size_that_is_too_small():
     with pytest.raises(ValueError, match="a size of at least 32 pixels, got 31"):
         render(make_env("hand_v1"), size=31)
