@@ -34,7 +34,7 @@ def _rules(groups: Any) -> Iterator[tuple[bool, str, Iterable[str]]]:
     learner, sources = groups.learner, groups.hindsight.sources
     takes, with_task = get_task_spec(groups.task.name).options, f"with task={groups.task.name}"
     yield "threshold" not in takes, with_task, ["task.threshold"]
-    # Tasks without this option end their episodes at goals in any case, so that nothing is a failure.
+    # Tasks without this option terminate episodes only at their goals, so there are no failures.
     yield "termination" not in takes, with_task, ["task.failure"]
     yield "dtype" not in takes, with_task, ["run.dtype"]
 

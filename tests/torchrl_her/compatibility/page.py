@@ -15,9 +15,9 @@ _ROLES = ("`HERWriter`", '`HERWriter(per="episode")`', "`HERSampleUnit`")
 _TOP = """# Which parts of TorchRL go together
 
 Beside another part of TorchRL, `HERWriter` and `HERSampleUnit` either work, or raise an error that names the
-reason. The tests try each cell of the two tables below. Their environment's observations tell the run,
-environment, episode and step that they are from, so each transition of a buffer, or of a batch drawn from
-it, is compared with what was collected.
+reason. The tests try each cell of the two tables below. In their environment, observations contain the run,
+environment, episode and step. So each transition of a buffer, or of a sampled batch, is compared with the
+collected one.
 
 - **yes**: all transitions were right. Each virtual goal was achieved in the same episode, and not before the
   transition; rewards and ends fit it; no real transition is lost or stored twice. Sequences drawn by samplers
@@ -32,9 +32,9 @@ A learner extends its buffer with what a collector yields. Environments with a b
 batched. The writer takes batches [N, T] as they are. For the unit they are flattened, `batch.reshape(-1)`, or
 go into a storage with `ndim=2`, called [T, N] here. With `replay_buffer=` the collector itself writes.
 
-Each cell was tried in three ways: with trajectory ids, which collectors write unless told otherwise; with the
-ids of the transform [`EnvIds`](replay_buffers.md), too; and with no ids at all. A cell that says nothing of
-ids is the same in all three. What worker processes write by themselves is refused whatever the ids.
+Each cell was tried in three ways: with trajectory ids, which collectors write by default; with the ids of the
+transform [`EnvIds`](replay_buffers.md), too; and without ids. A cell that does not mention ids is the same in
+all three. If worker processes write by themselves, this is refused with any ids.
 
 """
 
@@ -61,7 +61,7 @@ Tried in November 2026, all with success; `make test-versions` tries the ends of
 | 3.11.7 | 2.15.0 | 0.14.3 | 0.14.1 |
 | 3.11.7 | 2.15.0 | 0.15.3 | nightly |
 
-TorchRL asks for the tensordict of its own minor release, from 0.14.2 on, and takes any torch. "nightly" is
+TorchRL requires tensordict of its own minor release, from 0.14.2 on, and allows any torch. "nightly" is
 `torchrl-nightly` 2026.10.27, which stands in for TorchRL 0.15 until that is released.
 """
 

@@ -30,7 +30,7 @@ class Refusal:
 REFUSALS: dict[str, Refusal] = {
     "EnvIds": Refusal(
         r"torchrl_her\.EnvIds\(\)",
-        "The batch does not show which environment a transition is of, or whether its episode goes on. "
+        "The batch does not show which environment a transition is from, or whether its episode continues. "
         "The message names the remedy, `EnvIds`.",
     ),
     "padded": Refusal(
@@ -66,7 +66,7 @@ REFUSALS: dict[str, Refusal] = {
     ),
     "no list": Refusal(
         "HERSampleUnit needs a storage of tensordicts",
-        "The unit looks for goals in the whole storage at once.",
+        "The unit reads the whole storage as one tensordict to find goals.",
     ),
     "list storage": Refusal(
         "slices.*LazyTensorStorage",
@@ -85,7 +85,11 @@ REFUSALS: dict[str, Refusal] = {
         "A storage of two dimensions takes [N, T] batches.",
         ours=False,
     ),
-    "2-D add": Refusal("meshgrid expects|expand_as_right requires", "The same, step by step.", ours=False),
+    "2-D add": Refusal(
+        "meshgrid expects|expand_as_right requires",
+        "A storage of two dimensions takes [N, T] batches, not single steps.",
+        ours=False,
+    ),
     "needs ids": Refusal("trajs_per_batch requires", "`trajs_per_batch` needs trajectory ids.", ours=False),
     "list slices": Refusal(
         "Could not get a tensordict out of the storage",
