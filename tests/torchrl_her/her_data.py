@@ -89,6 +89,12 @@ def tags(x: Tensor) -> list[float]:
     return x[..., 0].tolist()
 
 
+def same(one: TensorDict, other: TensorDict) -> bool:
+    """Whether two tensordicts have the same entries, bit for bit."""
+    keys = set(one.keys(True, True))
+    return keys == set(other.keys(True, True)) and all(torch.equal(one[key], other[key]) for key in keys)
+
+
 def pairs(rows: TensorDict) -> set[tuple[float, float]]:
     """Observations and the goals that they were given; real goals are left out."""
     found = zip(tags(rows["observation"]), tags(rows["desired_goal"]), strict=True)

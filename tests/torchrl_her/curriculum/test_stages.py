@@ -69,16 +69,6 @@ def test_widths_and_indices_of_the_hand() -> None:
     ]
 
 
-def test_inputs_keep_their_meaning_from_stage_to_stage() -> None:
-    curriculum = make_three()
-    state = torch.cat((torch.tensor([10.0, 20.0, 30.0, 40.0]), torch.zeros(1)))
-    inputs = []
-    for states, columns in zip(curriculum.state_index, curriculum.input_index, strict=True):
-        observation, _, goal = state[states].split([3, 1, 1])
-        inputs.append(torch.cat((observation, goal, torch.zeros(1)))[columns].tolist())
-    assert inputs == [[10.0, 20.0, 0.0, 0.0], [10.0, 20.0, 30.0, 0.0], [10.0, 20.0, 30.0, 40.0]]
-
-
 def test_names_stand_for_indices() -> None:
     names = {"hand": [0, 1, 2], "ball": [3, 4], "hole": [5, 6]}
     reach = make_stage("reach", observation="hand", achieved_goal=[0, 1], desired_goal="ball")
@@ -210,14 +200,6 @@ def test_the_defaults_of_the_thesis() -> None:
     assert not worse.record_run(0, flags("1" * 17 + "000"))
 
 
-def test_only_a_full_window_counts() -> None:
-    progress = make_progress()
-    assert not progress.record_run(0, flags("111"))
-    assert progress.stages == (0,)
-    assert progress.record_run(0, flags("0"))
-    assert progress.stages == (1,)
-
-
 def test_a_stage_ends_after_some_evaluations_at_the_latest() -> None:
     curriculum = Curriculum([make_stage("a"), make_stage("b")], 5)
     progress = CurriculumProgress(curriculum, runs=2, window=2, patience=3)
@@ -229,40 +211,6 @@ def test_a_stage_ends_after_some_evaluations_at_the_latest() -> None:
     assert again.record(poor).tolist() == [True, True]
     assert (again.stages, again.evaluations) == ((1, 1), [0, 0])
     assert [again.record(poor).tolist() for _ in range(4)] == 4 * [[False, False]]  # the last one has no end
-
-
-def test_the_window_slides() -> None:
-    progress = make_progress()
-    assert not progress.record_run(0, flags("0000110"))
-    assert progress.successes == [[0.0, 1.0, 1.0, 0.0]]
-    assert progress.record_run(0, flags("1"))  # 1 1 0 1
-
-
-def test_the_window_is_cleared_at_a_change() -> None:
-    progress = make_progress()
-    assert progress.record_run(0, flags("1111"))
-    assert progress.successes == [[]]
-    assert not progress.record_run(0, flags("111"))  # with an old sample it would be full
-    assert progress.stages == (1,)
-
-
-def test_samples_behind_the_end_of_a_stage_are_dropped() -> None:
-    progress = make_progress()
-    assert progress.record_run(0, flags("1" * 40))
-    assert progress.stages == (1,)  # a call ends one stage
-    assert progress.successes == [[]]
-
-
-def test_a_stage_ends_at_its_first_full_window_within_a_call() -> None:
-    progress = make_progress()
-    assert progress.record_run(0, flags("1111" + "0000"))  # as sample by sample
-
-
-def test_stages_are_counted_from_the_data() -> None:
-    progress = make_progress()
-    moved = [progress.record_run(0, flags("1111")) for _ in range(4)]
-    assert moved == [True, True, False, False]
-    assert progress.stages == (2,)
 
 
 def test_the_last_stage_has_no_end_but_experts() -> None:
@@ -286,10 +234,6 @@ def test_each_run_moves_on_by_itself() -> None:
     assert progress.stage.dtype == torch.int64
     assert progress.successes == [[0.0] * 4, [], [1.0, 1.0, 0.0, 0.0]]
     assert [progress.stage_of(run).name for run in range(3)] == ["stage 0", "stage 1", "stage 0"]
-
-
-def test_samples_may_be_bools() -> None:
-    assert make_progress().record_run(0, flags("1111").bool())
 
 
 def test_what_is_read_is_a_copy() -> None:

@@ -73,12 +73,6 @@ def test_even_the_largest_random_number_draws_a_goal_that_may_be_drawn(
     assert index.item() == 2
 
 
-def test_the_same_generator_draws_the_same() -> None:
-    likelihood = torch.ones(3, 5)
-    draws = [draw(likelihood, 4, generator=torch.Generator().manual_seed(7))[0] for _ in range(2)]
-    assert torch.equal(*draws)
-
-
 @pytest.mark.parametrize("strategy", ["future", "final", "episode"])
 def test_drawing_all_alike_is_drawing_from_the_candidates(strategy: str) -> None:
     lengths, n = torch.tensor([1, 4]), 20_000

@@ -27,22 +27,8 @@ def test_an_episode_goes_on_over_the_end_of_the_ring() -> None:
     assert episodes_of([0, 1, 0, 1, 0], oldest=2) == [[2, 3], [4, 0, 1]]
 
 
-def test_an_open_episode_ends_at_the_cursor() -> None:
-    # Slots 0 and 1 are the newest; slot 2 lost the beginning of its episode.
-    assert episodes_of([0, 0, 0, 1, 1], [7, 7, 5, 5, 6], oldest=2) == [[2, 3], [4], [0, 1]]
-
-
 def test_without_ids_the_cursor_alone_keeps_the_newest_from_the_oldest() -> None:
     assert episodes_of([0, 0, 0, 1, 1], oldest=2) == [[2, 3], [4], [0, 1]]
-
-
-def test_flat_rows_of_a_trajectory_belong_together_wherever_they_lie() -> None:
-    # Two environments, two steps of each at a time
-    assert episodes_of([0, 0, 0, 0, 0, 1, 0, 0], [1, 1, 2, 2, 1, 1, 2, 2]) == [[0, 1, 4, 5], [2, 3, 6, 7]]
-
-
-def test_an_id_may_be_used_again_when_its_episode_was_done() -> None:
-    assert episodes_of([0, 1, 0, 0, 0, 1], [0, 0, 1, 1, 0, 0]) == [[0, 1], [4, 5], [2, 3]]
 
 
 def test_lanes_are_kept_apart_though_they_use_the_same_ids() -> None:

@@ -23,11 +23,6 @@ def test_keys_under_next() -> None:
     assert in_root_and_next([]) == []
 
 
-def test_one_key_is_no_list_of_keys() -> None:
-    with pytest.raises(TypeError, match=r"keys must be given as a list, got 'state': write \['state'\]"):
-        in_root_and_next("state")
-
-
 def test_what_relabeling_changes_by_hand() -> None:
     names = EnvKeys(desired_goal=("agent", "wanted"), reward="cost")
     keys = HindsightOptions(keys=names).transition_keys()

@@ -242,6 +242,32 @@ def test_narrow_trajectory_ids_do_not_wrap_around() -> None:
     assert len(buffer[:]["collector", "traj_ids"].unique()) == 82  # of two episodes and 40 copies of each
 
 
+@pytest.mark.parametrize("make", [writing, sampling])
+@pytest.mark.parametrize("key", [*GOALS, *(("next", key) for key in ("reward", "truncated", "done"))])
+def test_a_missing_entry_is_named(make: Callable[..., TensorDictReplayBuffer], key: NestedKey) -> None:
+    with pytest.raises(KeyError, match=f"relabeling needs the entry {re.escape(repr(key))}, got "):
+        fill(make(filter_achieved=True), make_batch([[3], [3]]).exclude(key))
+
+
+@pytest.mark.parametrize("make", [writing, sampling])
+def test_rows_of_several_stages_are_refused_where_one_reward_relabels_them(
+    make: Callable[..., TensorDictReplayBuffer],
+) -> None:
+    batch = make_batch([[3], [3]]).set("stage", torch.zeros(2, 3, 1, dtype=torch.int64))
+    with pytest.raises(ValueError, match=r"carry their stage \('stage'\).* HERWriter\(stages=\[...\]\)"):
+        fill(make(), batch)
+    fill(make(stage_key="floor"), batch)
+    writing(k=0).extend(batch)
+
+
+@pytest.mark.parametrize("make", [writing, sampling])
+def test_rewards_of_another_rule_are_named_once(make: Callable[..., TensorDictReplayBuffer]) -> None:
+    buffer, batch = make(GoalReward(1e9)), make_batch([[4], [4]])
+    with pytest.warns(UserWarning, match="gives 0 where the collected reward is -1, and other .* in 8 of 8"):
+        fill(buffer, batch.clone())
+    fill(buffer, batch)
+
+
 # Lazy stacks
 
 

@@ -82,6 +82,12 @@ def test_episodes_of_length_one_and_success_at_the_first_step(relabel: Relabel) 
     assert (rows["next", "reward"] == 0).all()
 
 
+@pytest.mark.parametrize(("k", "share"), [(0, 0.0), (1, 0.5), (4, 0.8)])
+def test_share_of_virtual_rows_in_a_batch(k: int, share: float, relabel: Relabel) -> None:
+    virtual = relabel(make_batch([[20] * 65] * 4), k=k)["virtual"]
+    assert virtual.float().mean().item() == pytest.approx(share, abs=0.015)
+
+
 # What follows from a goal
 
 
@@ -240,12 +246,20 @@ def test_goals_that_are_passed_on_the_way_cut_the_steps(relabel: Relabel) -> Non
     assert (second["steps_to_next_obs"].item(), second["next", "terminated"].item()) == (3, True)
 
 
-def test_returns_over_several_steps_have_the_info_of_each(relabel: Relabel) -> None:
-    rule, batch = costly([[3]])
+@pytest.mark.parametrize("filtered", [False, True])
+@pytest.mark.parametrize(
+    ("n_steps", "rewards"), [(1, [-1.25, -1.5, -0.75]), (2, [-1.25 - 0.5 * 1.5, -1.5 - 0.5 * 0.75, -0.75])]
+)
+def test_virtual_transitions_are_rewarded_with_their_own_info(
+    n_steps: int, rewards: list[float], filtered: bool, relabel: Relabel
+) -> None:
+    rule, batch = costly([[3], [3]])
     options: dict[str, Any] = {"strategy": "final", "k": 1, "achieved_reward": -0.9}
-    rows = virtual_of(relabel(batch, reward=rule, n_steps=2, gamma=0.5, **options))
-    returns = set(zip(tags(rows["observation"]), tags(rows["next", "reward"]), strict=True))
-    assert returns == {(0.0, -1.25 - 0.5 * 1.5), (1.0, -1.5 - 0.5 * 0.75), (2.0, -0.75)}
+    options |= {"n_steps": n_steps, "gamma": 0.5, "filter_achieved": filtered}
+    rows = virtual_of(relabel(batch, reward=rule, **options))
+    step = rows["observation"][:, :1] % 1000
+    assert set(zip(tags(step), tags(rows["next", "reward"]), strict=True)) == set(enumerate(rewards))
+    assert torch.equal(rows["next", "terminated"], step + n_steps >= 3)
 
 
 # Ends that have nothing to do with the goal
@@ -301,11 +315,3 @@ def test_keys_of_ones_own(relabel: Relabel) -> None:
     assert is_virtual.float().mean().item() == pytest.approx(0.8, abs=1e-6 if relabel is written else 0.02)
     assert torch.equal(rows["goals", "wanted"], rows["next", "goals", "wanted"])
     assert (rows["next", "cost"][is_virtual] == 0).any()
-
-
-@pytest.mark.parametrize("kind", [HERWriter, HERSampleUnit])
-def test_bad_options_are_named(kind: Any) -> None:
-    with pytest.raises(ValueError, match="k must be at least 0, got -1"):
-        kind(REWARD, k=-1)
-    with pytest.raises(ValueError, match="unknown goal strategy 'nearest'"):
-        kind(REWARD, strategy="nearest")

@@ -6,7 +6,6 @@ Goals are tagged with the environment, episode and state that they come from (se
 from __future__ import annotations
 
 import pickle
-import re
 from functools import partial
 from inspect import signature
 from itertools import chain
@@ -21,10 +20,7 @@ from tensordict import TensorDict
 from torch import Tensor
 from torchrl.data import (
     HERReplayBuffer,
-    LazyMemmapStorage,
     LazyTensorStorage,
-    ListStorage,
-    TensorDictPrioritizedReplayBuffer,
     TensorDictReplayBuffer,
     TensorStorage,
 )
@@ -34,17 +30,16 @@ from torchrl.data.replay_buffers.samplers import (
     PrioritizedSliceSampler,
     RandomSampler,
     Sampler,
-    SamplerWithoutReplacement,
     SliceSampler,
     SliceSamplerWithoutReplacement,
 )
 from torchrl.data.replay_buffers.writers import ImmutableDatasetWriter, TensorDictMaxValueWriter
-from torchrl.envs.transforms import MultiStepTransform, RewardScaling
+from torchrl.envs.transforms import RewardScaling
 
 from torchrl_her import GoalReward, HERSampleUnit, HERWriter
 from torchrl_her.trainers import buffer_state_dict, load_buffer_state_dict
 
-from ..her_data import WANTED, PreferFar, along, costly, make_batch, pairs, tag, tags
+from ..her_data import WANTED, PreferFar, along, make_batch, pairs, tag, tags
 
 pytestmark = pytest.mark.filterwarnings("ignore:the reward function gives")  # made up as each test needs it
 REWARD = GoalReward(0.5)  # tags differ by at least 1
@@ -105,22 +100,6 @@ def virtual_rows(buffer: TensorDictReplayBuffer, size: int = 2_000) -> TensorDic
 # Where goals come from
 
 
-def test_torchrl_never_lends_the_last_state_and_lends_goals_that_are_achieved_already() -> None:
-    buffer = make_torchrl()
-    buffer.extend(flat([[3]]))
-    # It reads the root's achieved goals: 3 is never lent, and (t, t) is where the row begins.
-    assert pairs(buffer.sample()) == {(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)}
-
-
-def test_every_candidate_is_as_likely_as_any_other() -> None:
-    buffer = make_buffer(k=NEVER_REAL)
-    buffer.extend(flat([[4]]))
-    rows = buffer.sample(12_000)
-    first = rows["desired_goal"][rows["observation"][:, 0] == 0, 0]
-    shares = [(first == goal).float().mean().item() for goal in (1, 2, 3, 4)]
-    assert shares == pytest.approx([0.25] * 4, abs=0.04)  # five standard deviations
-
-
 def test_rows_of_an_open_episode_may_take_goals_up_to_the_newest() -> None:
     for strategy in ("future", "final"):
         buffer = make_buffer(strategy=strategy)
@@ -137,15 +116,6 @@ def test_stretches_of_environments_in_turn_make_whole_episodes() -> None:
         buffer.extend(whole[:, start : start + 2].reshape(-1).clone())
     expected = {(tag(env, 0, t), tag(env, 0, 6)) for env in (0, 1) for t in range(6)}
     assert pairs(buffer.sample(1_000)) == expected
-
-
-def test_torchrl_leaks_between_environments() -> None:
-    rows = flat([[9], [9]], steps=3)  # two open episodes, one behind the other
-    theirs, ours = make_torchrl(strategy="final"), make_buffer(strategy="final")
-    theirs.extend(rows.clone())
-    ours.extend(rows.clone())
-    assert (0.0, 1002.0) in pairs(theirs.sample())
-    assert pairs(ours.sample(500)) == {(tag(env, 0, t), tag(env, 0, 3)) for env in (0, 1) for t in range(3)}
 
 
 def test_torchrl_leaks_where_the_ring_begins_again() -> None:
@@ -250,31 +220,6 @@ def test_no_goal_ever_leaks(
 # What follows from a goal
 
 
-def test_torchrl_leaves_terminated_as_it_was() -> None:
-    buffer = make_torchrl()
-    buffer.extend(flat([[3]]))
-    after = buffer.sample()["next"]
-    assert (after["reward"] == 0).any()
-    assert not after["terminated"].any()
-
-
-def test_real_rows_and_other_entries_stay_and_the_storage_is_untouched() -> None:
-    batch = flat([[4, 2]])
-    buffer = make_buffer()
-    buffer.extend(batch.clone())
-    rows = buffer.sample(300)
-    origin, real = batch[rows["index"]], ~rows["virtual"].squeeze(-1)
-    assert 0 < real.sum() < 300
-    for key in batch.exclude("state", ("next", "state")).keys(True, True):
-        assert torch.equal(rows[key][real], origin[key][real]), key
-    for key in ("observation", "action", "achieved_goal", ("next", "observation"), ("next", "truncated")):
-        assert torch.equal(rows[key], origin[key]), key
-    for key in batch.keys(True, True):
-        assert torch.equal(buffer.storage[:][key], batch[key]), key
-    assert "state" not in rows.keys()
-    assert ("next", "state") not in rows.keys(True)
-
-
 def test_transforms_see_the_lent_goal_and_torchrls_do_not() -> None:
     def with_input(rows: TensorDict) -> TensorDict:
         return rows.set("input", torch.cat((rows["observation"], rows["desired_goal"]), -1))
@@ -306,17 +251,6 @@ def test_shapes_and_kinds_of_numbers_are_those_of_the_storage() -> None:
 # Filter and weights
 
 
-def test_rows_without_a_candidate_stay_real() -> None:
-    buffer = make_buffer(filter_achieved=True, k=NEVER_REAL)
-    buffer.extend(along([0, 1, 1, 1]).reshape(-1))
-    rows = buffer.sample(300)
-    assert torch.equal(rows["virtual"], rows["observation"][:, :1] == 0)
-    assert pairs(rows) == {(0.0, 1.0)}
-    real = ~rows["virtual"]
-    assert (rows["next", "reward"][real] == -1).all()
-    assert not rows["next", "terminated"][real].any()
-
-
 def test_many_rows_are_drawn_piece_by_piece(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("torchrl_her.replay_buffers.sample_unit.LIKELIHOODS", 64)
     buffer = make_buffer(weights=PreferFar(), strategy="episode", k=NEVER_REAL)
@@ -340,15 +274,6 @@ def test_weights_that_promise_to_be_alike_are_not_asked() -> None:
 # Buffers
 
 
-@pytest.mark.parametrize(("k", "share"), [(0, 0.0), (1, 0.5), (4, 0.8)])
-def test_share_of_virtual_rows_in_a_batch(k: int, share: float) -> None:
-    buffer = make_buffer(k=k)
-    buffer.extend(flat([[20] * 5] * 3))
-    rows = buffer.sample(20_000)
-    assert rows["virtual"].float().mean().item() == pytest.approx(share, abs=0.015)
-    assert torch.equal(rows["virtual"].squeeze(-1), rows["desired_goal"][:, 0] != WANTED)
-
-
 @pytest.mark.parametrize("ndim", [1, 2])
 def test_priorities_are_those_of_the_real_rows(ndim: int) -> None:
     buffer = make_buffer(40, per=True, ndim=ndim)
@@ -365,22 +290,6 @@ def test_priorities_are_those_of_the_real_rows(ndim: int) -> None:
     assert set(tags(rows["desired_goal"])) == {WANTED, *(1005.0 + t for t in range(6))}
 
 
-def test_a_prioritized_buffer_of_torchrls() -> None:
-    unit = HERSampleUnit(REWARD)
-    buffer = TensorDictPrioritizedReplayBuffer(
-        alpha=0.6, beta=0.4, storage=LazyTensorStorage(50), sample_unit=unit, collate_fn=unit.relabel
-    )
-    buffer.extend(flat([[5]]))
-    assert buffer.sample(50)["virtual"].any()
-
-
-def test_rows_drawn_without_replacement_are_each_drawn_once() -> None:
-    buffer = make_beside(sampler=SamplerWithoutReplacement(), batch_size=5)
-    buffer.extend(flat([[4, 6]]))
-    seen = [tags(batch["observation"]) for batch in buffer]
-    assert sorted(chain.from_iterable(seen)) == [0, 1, 2, 3, 100, 101, 102, 103, 104, 105]
-
-
 def test_batches_that_are_prefetched_by_threads() -> None:
     buffer = make_beside(storage=LazyTensorStorage(1_000), batch_size=64, prefetch=4)
     buffer.extend(flat([[7] * 20] * 4))
@@ -391,14 +300,6 @@ def test_batches_that_are_prefetched_by_threads() -> None:
         assert torch.equal(lent, rows["virtual"].squeeze(-1))
         assert torch.equal((observation / 100).floor()[lent], ((goal - 1) / 100).floor()[lent])
     buffer.shutdown()
-
-
-def test_rows_on_disk() -> None:
-    buffer = make_beside(storage=LazyMemmapStorage(20), batch_size=100)
-    batch = flat([[4, 6]])
-    buffer.extend(batch.clone())
-    assert buffer.sample()["virtual"].any()
-    assert torch.equal(buffer.storage[:]["desired_goal"], batch["desired_goal"])
 
 
 def test_a_data_set_that_nobody_writes() -> None:
@@ -487,29 +388,6 @@ def test_a_used_unit_can_be_copied_to_another_process() -> None:
 # Options
 
 
-@pytest.mark.parametrize(
-    "key",
-    ["achieved_goal", "desired_goal", ("next", "achieved_goal"), ("next", "done"), ("next", "truncated")],
-)
-def test_a_missing_entry_is_named(key: Any) -> None:
-    buffer = make_buffer(k=NEVER_REAL)
-    buffer.extend(flat([[4]]).exclude(key))
-    with pytest.raises(KeyError, match=f"relabeling needs the entry {re.escape(repr(key))}"):
-        buffer.sample(4)
-
-
-def test_a_storage_without_tensordicts_is_refused() -> None:
-    unit = HERSampleUnit(REWARD)
-    buffer = make_beside(
-        unit, storage=ListStorage(9), collate_fn=lambda rows: unit.relabel(torch.stack(rows))
-    )
-    buffer.extend(flat([[4]]))
-    with pytest.raises(
-        TypeError, match="needs a storage of tensordicts.* got a ListStorage that gives a list"
-    ):
-        buffer.sample(4)
-
-
 def test_a_unit_without_its_other_half_is_noticed() -> None:
     buffer = make_beside(collate_fn=None)
     buffer.extend(flat([[4]]))
@@ -523,15 +401,6 @@ def test_a_unit_without_its_other_half_is_noticed() -> None:
     buffer.sample()  # the function may have relabeled
     with pytest.raises(RuntimeError, match="nothing puts into batches"):
         buffer.sample()
-
-
-def test_rewards_of_another_rule_are_named_once() -> None:
-    buffer = make_buffer(reward=GoalReward(1e9))
-    buffer.extend(flat([[4]]))
-    with pytest.warns(UserWarning, match="gives 0 where the collected reward is -1, and other .* in 4 of 4"):
-        buffer.sample(4)
-    buffer.extend(flat([[4]]))
-    buffer.sample(4)
 
 
 def test_a_batch_of_another_size_is_refused() -> None:
@@ -760,12 +629,7 @@ def test_ids_that_are_used_again_join_no_episodes(ndim: int) -> None:
 # Parts that cannot work together
 
 
-def test_an_ensemble_is_refused_at_its_first_sample() -> None:
-    members = [make_buffer(), make_buffer()]
-    for member in members:
-        member.extend(flat([[5]]))
-    with pytest.raises(RuntimeError, match="no goals were chosen .* in a ReplayBufferEnsemble, relabel"):
-        ReplayBufferEnsemble(*members, batch_size=10).sample()
+def test_a_unit_of_an_ensemble_is_refused_at_its_first_sample() -> None:
     unit = HERSampleUnit(REWARD)
     plain = [TensorDictReplayBuffer(storage=LazyTensorStorage(20)) for _ in range(2)]
     for member in plain:
@@ -796,12 +660,6 @@ def test_two_units_do_not_mix_up_their_batches() -> None:
     ("parts", "batch", "error", "message"),
     [
         (
-            {"consume_after_n_samples": 1},
-            flat([[5]]),
-            ValueError,
-            "HERSampleUnit cannot work in a buffer that consumes",
-        ),
-        (
             {"writer": partial(TensorDictMaxValueWriter, rank_key=("next", "reward"))},
             flat([[5]]),
             ValueError,
@@ -812,24 +670,6 @@ def test_two_units_do_not_mix_up_their_batches() -> None:
             flat([[5]]),
             ValueError,
             "but a HERWriter with k=4 relabels them: use one of the two",
-        ),
-        (
-            {"transform": partial(MultiStepTransform, n_steps=2, gamma=0.9)},
-            flat([[5]]),
-            ValueError,
-            "HERSampleUnit got transitions that span several steps",
-        ),
-        (
-            {},
-            make_batch([[5], [5]]),
-            ValueError,
-            r"each item of this storage \(ndim=1\) holds 5: .*ndim=2",
-        ),
-        (
-            {},
-            flat([[5]]).set(("collector", "mask"), torch.ones(5, dtype=torch.bool)),
-            ValueError,
-            "HERSampleUnit needs batches that are not split and padded",
         ),
         (
             {"sampler": partial(SliceSampler, slice_len=4, traj_key=IDS, truncated_key=("next", "cut"))},
@@ -873,17 +713,3 @@ def test_excluding_a_nested_entry_excludes_no_other_one() -> None:
     keys = set(buffer.sample(4).keys(True, True))
     assert ("next", "observation") in keys
     assert not {("agent", "observation"), ("next", "agent", "observation")} & keys
-
-
-@pytest.mark.parametrize("ndim", [1, 2])
-@pytest.mark.parametrize("filtered", [False, True])
-def test_virtual_transitions_are_rewarded_with_their_own_info(ndim: int, filtered: bool) -> None:
-    rule, batch = costly([[3], [3]])
-    options = {"strategy": "final", "k": NEVER_REAL, "achieved_reward": -0.9, "filter_achieved": filtered}
-    buffer = make_buffer(reward=rule, ndim=ndim, **options)
-    buffer.extend(batch.reshape(-1) if ndim == 1 else batch)
-    rows = buffer.sample(200)
-    after = rows["next"]
-    steps = [step % 1000 for step in tags(rows["observation"])]
-    seen = set(zip(steps, tags(after["reward"]), tags(after["terminated"]), strict=True))
-    assert seen == {(0.0, -1.25, False), (1.0, -1.5, False), (2.0, -0.75, True)}

@@ -7,7 +7,6 @@ import hashlib
 import io
 import os
 import tracemalloc
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -44,7 +43,7 @@ from torchrl_her.trainers import (
 from torchrl_her.trainers.sampler_state import load_sampler_state_dict, sampler_state_dict
 from torchrl_her_envs import make_env
 
-from ..her_data import make_batch
+from ..her_data import make_batch, same
 
 MARK = b"torchrl-her checkpoint 1\n"
 STATE = {"epoch": 3, "name": "her", "rates": [0.5, None], "nested": {"weights": torch.arange(4.0)}}
@@ -68,13 +67,6 @@ def test_what_could_not_be_loaded_is_not_saved(value: Any, tmp_path: Path) -> No
     with pytest.raises(TypeError, match=said):
         save_checkpoint({"own": [1, value]}, tmp_path / "checkpoint.pt")
     assert not list(tmp_path.iterdir())
-
-
-def test_a_checkpoint_is_replaced(tmp_path: Path) -> None:
-    path = str(tmp_path / "checkpoint.pt")
-    save_checkpoint({"epoch": 1}, path)
-    save_checkpoint({"epoch": 2}, path)
-    assert load_checkpoint(path) == {"epoch": 2}
 
 
 @pytest.fixture(scope="module")
@@ -237,11 +229,6 @@ def test_the_last_ones_are_kept(tmp_path: Path) -> None:
     assert found == {"checkpoint.pt": 5, "checkpoint.1.pt": 4, "checkpoint.2.pt": 3}
 
 
-def test_the_newest_is_used(tmp_path: Path) -> None:
-    with warnings.catch_warnings(action="error"):
-        assert load_newest_checkpoint(saved(tmp_path, epochs=3)) == {"epoch": 3}
-
-
 @pytest.mark.parametrize("data", [b"", b"torchrl-her checkpoint 1\nhalf a check", b"something else"])
 def test_the_one_before_a_damaged_one_is_used(tmp_path: Path, data: bytes) -> None:
     path = saved(tmp_path, epochs=3)
@@ -291,28 +278,24 @@ MAKE_SAMPLER: dict[str, Callable[[int], Sampler]] = {
 
 
 def make_buffer(sampler: str, capacity: int = 64) -> TensorDictReplayBuffer:
+    writer = HERWriter(GoalReward(0.5), k=2)
+    return buffer_of(MAKE_SAMPLER[sampler](capacity), LazyTensorStorage(capacity), writer=writer)
+
+
+def buffer_of(sampler: Sampler, storage: LazyTensorStorage, **parts: Any) -> TensorDictReplayBuffer:
     buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(capacity),
-        writer=HERWriter(GoalReward(0.5), k=2),
-        sampler=MAKE_SAMPLER[sampler](capacity),
-        batch_size=16,
-        priority_key="td_error",
+        storage=storage, sampler=sampler, batch_size=16, priority_key="td_error", **parts
     )
     buffer.set_rng(torch.Generator().manual_seed(1))
     return buffer
 
 
-def train(buffer: TensorDictReplayBuffer) -> TensorDict:
+def draw(buffer: TensorDictReplayBuffer) -> TensorDict:
     """What a gradient step does to a buffer."""
     rows = buffer.sample()
     rows["td_error"] = rows["observation"][:, 0].abs() % 7.0 + 0.1
     buffer.update_tensordict_priority(rows)
     return rows
-
-
-def same(one: TensorDict, other: TensorDict) -> bool:
-    keys = set(one.keys(True, True))
-    return keys == set(other.keys(True, True)) and all(torch.equal(one[key], other[key]) for key in keys)
 
 
 def resumed(buffer: TensorDictReplayBuffer, sampler: str, folder: Path) -> TensorDictReplayBuffer:
@@ -344,17 +327,17 @@ def test_a_resumed_buffer_goes_on_as_the_unbroken_one(
     buffer = make_buffer(sampler, capacity)
     for _ in range(batches):
         buffer.extend(make_batch([[5, 5], [10], [3, 7]], steps=10))
-        train(buffer)
+        draw(buffer)
     other = resumed(buffer, sampler, tmp_path)
     assert len(other) == len(buffer)
     assert same(other[:], buffer[:])
     for _ in range(3):
-        assert same(train(other), train(buffer))
+        assert same(draw(other), draw(buffer))
     more = make_batch([[4, 6], [7, 3]])
     assert torch.equal(other.extend(more.clone()), buffer.extend(more.clone()))
     assert other.writer.counts == buffer.writer.counts
     for _ in range(3):
-        assert same(train(other), train(buffer))
+        assert same(draw(other), draw(buffer))
 
 
 @SAMPLERS
@@ -362,7 +345,7 @@ def test_episodes_held_back_go_on(sampler: str, tmp_path: Path) -> None:
     buffer = make_buffer(sampler)
     buffer.extend(make_batch([[3, 9], [2, 9]], steps=6))
     assert buffer.writer.held_back == 3 + 4
-    train(buffer)  # new rows will get the greatest priority so far
+    draw(buffer)  # new rows will get the greatest priority so far
     other = resumed(buffer, sampler, tmp_path)
     assert other.writer.held_back == 7
     rest = make_batch([[3, 9], [2, 9]], first=[(1, 3), (1, 4)], steps=6)
@@ -370,7 +353,7 @@ def test_episodes_held_back_go_on(sampler: str, tmp_path: Path) -> None:
     assert other.writer.counts == buffer.writer.counts
     assert other.writer.counts.real == 3 + 2 + 9 + 9
     assert same(other[:], buffer[:])
-    assert same(train(other), train(buffer))
+    assert same(draw(other), draw(buffer))
 
 
 @SAMPLERS
@@ -379,13 +362,13 @@ def test_an_empty_buffer(sampler: str, emptied: bool, tmp_path: Path) -> None:
     buffer = make_buffer(sampler)
     if emptied:
         buffer.extend(make_batch([[5]]))
-        train(buffer)
+        draw(buffer)
         buffer.empty()
     other = resumed(buffer, sampler, tmp_path)
     assert len(other) == 0
     for own in (buffer, other):
         own.extend(make_batch([[6, 4], [10]]))
-    assert same(train(other), train(buffer))
+    assert same(draw(other), draw(buffer))
 
 
 @SAMPLERS
@@ -419,16 +402,8 @@ def test_a_state_without_a_copy_is_as_small(tmp_path: Path) -> None:
 def test_rows_of_two_dimensions_go_on(sampler: str, tmp_path: Path) -> None:
     def make() -> TensorDictReplayBuffer:
         hindsight = HERSampleUnit(GoalReward(0.5))
-        buffer = TensorDictReplayBuffer(
-            storage=LazyTensorStorage(40, ndim=2),
-            sampler=MAKE_SAMPLER[sampler](40),
-            sample_unit=hindsight,
-            collate_fn=hindsight.relabel,
-            batch_size=16,
-            priority_key="td_error",
-        )
-        buffer.set_rng(torch.Generator().manual_seed(1))
-        return buffer
+        storage, parts = LazyTensorStorage(40, ndim=2), {"collate_fn": hindsight.relabel}
+        return buffer_of(MAKE_SAMPLER[sampler](40), storage, sample_unit=hindsight, **parts)
 
     buffer, other = make(), make()
     buffer.extend(make_batch([[5, 9], [9, 5]], steps=7))
@@ -487,13 +462,6 @@ def make_steps(lengths: list[int], first: int) -> TensorDict:
     )
 
 
-def draw(buffer: TensorDictReplayBuffer) -> TensorDict:
-    rows = buffer.sample()
-    rows["td_error"] = rows["observation"][:, 0] % 7.0 + 0.1
-    buffer.update_tensordict_priority(rows)
-    return rows
-
-
 @pytest.mark.filterwarnings("ignore:SliceSampler returned a short flat batch:UserWarning")
 @pytest.mark.parametrize("emptied", [False, True])
 @pytest.mark.parametrize("over", [False, True], ids=["filled in part", "written over"])
@@ -515,14 +483,7 @@ def draw(buffer: TensorDictReplayBuffer) -> TensorDict:
 def test_the_next_batches_are_those_of_the_unbroken_run(
     make_sampler: Callable[[], Sampler], over: bool, emptied: bool, tmp_path: Path
 ) -> None:
-    def make() -> TensorDictReplayBuffer:
-        buffer = TensorDictReplayBuffer(
-            storage=LazyTensorStorage(100), sampler=make_sampler(), batch_size=16, priority_key="td_error"
-        )
-        buffer.set_rng(torch.Generator().manual_seed(3))
-        return buffer
-
-    buffer, other = make(), make()
+    buffer, other = (buffer_of(make_sampler(), LazyTensorStorage(100)) for _ in range(2))
     for first in (0, 10, 20) if over else (0,):
         buffer.extend(make_steps([5, 9, 3, 12, 7, 6], first))
         for _ in range(2):

@@ -83,22 +83,6 @@ def test_final_distance_is_that_of_the_first_episodes_last_step() -> None:
     assert final_distance(data).tolist() == pytest.approx(expected)
 
 
-@pytest.mark.parametrize(
-    ("ends", "expected"),
-    [
-        ("-U", -2.0),  # -1 - 0.5, and -1 forever after: -0.25 - 0.125 - ... = -0.5
-        ("--", -2.0),  # cut by the rollout's end
-        ("-T", -1.0),  # -1 + 0
-        ("T-", 0.0),
-        ("U-", -2.0),
-        ("UT", -2.0),  # the second episode's success is not the first one's
-        ("-B", -1.0),  # the goal achieved in the very last step
-    ],
-)
-def test_discounted_return(ends: str, expected: float) -> None:
-    assert discounted_return(rollout(ends), 0.5).tolist() == [expected]
-
-
 def test_discounted_return_of_other_rewards() -> None:
     data = rollout("--U-", "--T-", rewards=[[1.0, 2.0, 3.0, 100.0]] * 2)
     got = discounted_return(data, 0.1, tail_reward=9.0)

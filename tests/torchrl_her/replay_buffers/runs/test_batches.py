@@ -21,29 +21,6 @@ def make(numbers: list[list[float]], runs: int = 2, ids: list[int] | None = None
     return Batch.of(data, KEYS, runs=runs)
 
 
-def test_held_back_transitions_come_first() -> None:
-    held = make([[1.0, 2.0], [3.0, 4.0]]).take(torch.tensor([1, 2]))
-    batch = make([[5.0], [6.0]]).after(held)
-    assert batch.rows["x"].tolist() == [2.0, 3.0, 5.0, 6.0]
-    assert batch.ids.tolist() == [0, 1, 0, 1]
-    assert batch.run is not None
-    assert batch.run.tolist() == [0, 1, 0, 1]
-    assert len(batch) == 4
-
-
-def test_without_any_it_is_the_batch() -> None:
-    batch = make([[5.0], [6.0]])
-    assert batch.after(Batch.none(2)) is batch
-    nothing = batch.take(torch.tensor([], dtype=torch.int64))
-    assert len(nothing) == len(nothing.rows) == 0
-    assert batch.after(nothing) is batch
-
-
-def test_environments_that_are_told_apart_by_something_else_are_refused() -> None:
-    with pytest.raises(ValueError, match="told apart by places in the batch, this batch by environment ids"):
-        make([[5.0], [6.0]], ids=[7, 8]).after(make([[1.0], [2.0]]))
-
-
 def test_lanes_of_a_run_follow_those_of_the_run_before() -> None:
     """By places, environment 2 of run 1 is stream 2 + 1 * 4; ids 9, 9, 4, 4 are numbered as they come."""
     places = make([[0.0, 0.0], [0.0, 0.0], [0.0, 0.0], [0.0, 0.0]])

@@ -8,7 +8,7 @@ from tensordict import TensorDict
 from torchrl_her import GoalReward, HindsightOptions
 from torchrl_her.replay_buffers.episodes import Episodes
 from torchrl_her.replay_buffers.runs.chunk import Chunk
-from torchrl_her.replay_buffers.runs.counts import RunCounts, WriterCounts, real_positives, virtual_positives
+from torchrl_her.replay_buffers.runs.counts import real_positives, virtual_positives
 from torchrl_her.replay_buffers.runs.pieces import Piece
 from torchrl_her.replay_buffers.runs.written import WrittenRows
 
@@ -26,28 +26,6 @@ def written(reward: list[float], counts: list[int], goals: list[float] | None = 
     root = torch.arange(len(reward))
     changes = {} if goals is None else {"desired_goal": torch.tensor(goals).unsqueeze(-1)}
     return WrittenRows(root, root, dict(changes), torch.tensor(reward), counts)
-
-
-def test_counts_are_emptied_and_totals_are_not() -> None:
-    own = RunCounts(3)
-    own.add([2, 0], real=[5, 1], virtual=[20, 4])
-    own.add([2], real_positive=[2])
-    own.empty(2)
-    own.add([2], real=[3])
-    assert own.counts == [WriterCounts(real=1, virtual=4), WriterCounts(), WriterCounts(real=3)]
-    assert own.totals[2] == WriterCounts(real=8, virtual=20, real_positive=2)
-    assert WriterCounts.sum(own.totals) == WriterCounts(real=9, virtual=24, real_positive=2)
-
-
-def test_a_state_brings_the_counts_back() -> None:
-    own, other = RunCounts(2), RunCounts(2)
-    own.add([1], real=[5])
-    own.empty(1)
-    own.add([0], virtual=[4])
-    other.load_state_dict(own.state_dict())
-    assert (other.counts, other.totals) == (own.counts, own.totals)
-    other.add([0], virtual=[1])
-    assert own.counts[0].virtual == 4
 
 
 def test_positive_is_what_has_the_reward_of_an_achieved_goal() -> None:

@@ -9,7 +9,7 @@ from torchrl_her import HindsightOptions
 from torchrl_her.replay_buffers.episodes import Episodes
 from torchrl_her.replay_buffers.runs.recent import RecentGoals
 
-from ...her_data import WANTED, make_batch
+from ...her_data import make_batch
 
 KEYS = HindsightOptions().transition_keys()
 ROWS = make_batch([[2], [3]]).reshape(-1)  # two episodes; the third row is of an open one
@@ -23,12 +23,6 @@ def remembered(recent: RecentGoals, name: str) -> list[list[float] | None]:
 
 def after(recent: RecentGoals, run: torch.Tensor | None = RUN, **sizes: int) -> RecentGoals:
     return recent.after(ROWS, EPISODES, run, KEYS, sizes=sizes)
-
-
-def test_goals_of_whole_episodes_go_to_their_runs() -> None:
-    recent = after(RecentGoals.none(2), actual=5, achieved=5)
-    assert remembered(recent, "actual") == [[WANTED], [WANTED]]
-    assert remembered(recent, "achieved") == [[1.0, 2.0], [1001.0, 1002.0, 1003.0]]
 
 
 def test_only_what_is_asked_for_is_remembered_and_of_it_the_newest() -> None:
@@ -56,32 +50,6 @@ def test_of_more_goals_than_are_kept_those_of_all_environments_are_remembered() 
         steps = (tags % 1000).float()
         assert steps.mean().item() == pytest.approx(25.5, abs=1.0)  # at all times of an episode
         assert len(steps.unique()) > 30
-
-
-def test_a_run_without_new_episodes_keeps_what_it_has() -> None:
-    first = after(RecentGoals.none(2), achieved=9)
-    only = Episodes(EPISODES.rows[:1, :2], EPISODES.lengths[:1])
-    recent = first.after(ROWS, only, RUN[:1], KEYS, sizes={"achieved": 9})
-    assert remembered(recent, "achieved") == [[1.0, 2.0, 1.0, 2.0], [1001.0, 1002.0, 1003.0]]
-    none = Episodes(EPISODES.rows[:0], EPISODES.lengths[:0])
-    assert recent.after(ROWS, none, RUN[:0], KEYS, sizes={"achieved": 9}) is recent
-
-
-def test_lines_are_those_of_the_runs_asked_for() -> None:
-    recent = after(RecentGoals.none(2), achieved=9)
-    goals, lines = recent.lines("achieved", [0, 1])
-    assert lines.lengths.tolist() == [2, 3]
-    assert goals[lines.rows][..., 0].tolist() == [[1.0, 2.0, 2.0], [1001.0, 1002.0, 1003.0]]
-    goals, lines = recent.lines("achieved", [1])
-    assert goals[lines.rows][..., 0].tolist() == [[1001.0, 1002.0, 1003.0]]
-
-
-def test_emptying_a_run_leaves_the_others_and_a_state_brings_all_back() -> None:
-    recent = after(RecentGoals.none(2), actual=9, achieved=9).without_run(0)
-    assert remembered(recent, "achieved") == [None, [1001.0, 1002.0, 1003.0]]
-    again = RecentGoals.from_state(recent.state_dict())
-    assert remembered(again, "achieved") == remembered(recent, "achieved")
-    assert remembered(again, "actual") == [None, [WANTED]]
 
 
 def test_wanted_goals_get_the_type_of_achieved_ones() -> None:

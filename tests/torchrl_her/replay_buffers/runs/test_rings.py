@@ -44,36 +44,6 @@ def test_rows_that_do_not_fit_are_left_out_in_front(
     assert rings.sizes == [0, min(count, 4)]
 
 
-def test_emptying_a_run_leaves_the_others() -> None:
-    rings = Rings(2)
-    for run in range(2):
-        rings.moves(run, begin=0, count=3, capacity=4)
-    rings.empty(0)
-    assert (rings.cursors, rings.sizes) == ([0, 3], [0, 3])
-
-
-def test_places_of_one_run() -> None:
-    """Rows 4 and 1 after two copies, at 3 of 5 rows: these lie at 3 and 4, they at 0 and 1."""
-    places = Places(None, 5, runs=1)
-    places.note([0], [torch.tensor([4, 1])], [4])
-    assert places.rows([2], capacity=5).tolist() == [-1, 1, -1, -1, 0]
-
-
-def test_places_of_several_runs_in_several_pieces() -> None:
-    """Blocks of 10 rows. Run 0 begins at 9, run 1 at 0."""
-    places = Places(torch.tensor([0, 0, 1, 1]), 4, runs=2)
-    places.note([0, 1], [torch.tensor([0]), torch.tensor([3, 2])], [2, 2])  # run 0: a copy and row 0
-    places.note([0], [torch.tensor([1])], [3])  # two copies and row 1
-    assert places.rows([4, 2], capacity=10).tolist() == [0, 3, 11, 10]
-
-
-def test_rows_that_were_pushed_out_have_no_place() -> None:
-    """Of five rows of run 1, four fit; run 0 has room for its two."""
-    places = Places(torch.tensor([0, 0, 1, 1, 1, 1, 1]), 7, runs=2)
-    places.note([0, 1], [torch.tensor([0, 1]), torch.arange(2, 7)], [2, 5])
-    assert places.rows([2, 1], capacity=4).tolist() == [0, 1, -1, 5, 6, 7, 4]
-
-
 @settings(max_examples=30, deadline=None, derandomize=True)
 @given(
     counts=st.lists(st.tuples(st.integers(0, 1), st.integers(0, 9)), max_size=8), capacity=st.integers(1, 6)

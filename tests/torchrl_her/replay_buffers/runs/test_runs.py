@@ -26,7 +26,7 @@ from torchrl_her.replay_buffers.runs import (
 )
 from torchrl_her.trainers import buffer_state_dict, load_buffer_state_dict
 
-from ...her_data import make_batch
+from ...her_data import make_batch, same
 
 RUNS, ENVS, STEPS = 3, 2, 4
 GRID = GoalGrid((0.0, -1.0), (7_000.0, 1.0), (10, 1), warn=False)
@@ -95,11 +95,6 @@ def batches(lengths: list[list[int]], number: int) -> Iterator[TensorDict]:
 
 def block(batch: TensorDict, run: int) -> TensorDict:
     return batch[run * ENVS : (run + 1) * ENVS].clone()
-
-
-def same(one: TensorDict, other: TensorDict) -> bool:
-    keys = set(other.keys(True, True))
-    return set(one.keys(True, True)) == keys and all(torch.equal(one[key], other[key]) for key in keys)
 
 
 def assert_same_state(one: Any, other: Any) -> None:

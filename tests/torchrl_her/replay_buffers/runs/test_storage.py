@@ -19,6 +19,7 @@ from torchrl_her.replay_buffers.runs import PackedStorage
 from torchrl_her.replay_buffers.runs.storage import Move, layout, unpack, write_slices
 
 from ....forks import result_of
+from ...her_data import same
 
 TYPES = [torch.bool, torch.uint8, torch.int16, torch.float32, torch.float64, torch.int64, torch.bfloat16]
 
@@ -36,11 +37,6 @@ def make_rows(n: int, seed: int = 0) -> TensorDict:
     return TensorDict(
         {**entries, "next": {"x": entry(0, torch.float32, 9), "deep": {"y": entry(1, torch.bool, 1)}}}, [n]
     )
-
-
-def same(one: TensorDict, other: TensorDict) -> bool:
-    keys = set(other.keys(True, True))
-    return set(one.keys(True, True)) == keys and all(torch.equal(one[key], other[key]) for key in keys)
 
 
 def filled(kind: type, rows: TensorDict, capacity: int = 20) -> LazyTensorStorage:

@@ -29,29 +29,6 @@ def chunk(**options: object) -> Chunk:
     return Chunk(ROWS, RUN, PIECE, GoalReward(0.5), own, own.transition_keys())
 
 
-def test_a_piece_counts_by_runs() -> None:
-    assert PIECE.sums(torch.tensor([7, 8])) == [7, 8]
-    assert PIECE.counts(torch.tensor([0, 4, 4, 6]), RUN) == [1, 3]
-    assert PIECE.counts(torch.tensor([4]), RUN) == [0, 1]
-    assert Piece([0], PIECE.episodes).sums(torch.tensor([7, 8])) == [15]
-    assert Piece([0], PIECE.episodes).counts(torch.tensor([0, 4, 4]), None) == [3]
-
-
-def test_single_transitions() -> None:
-    own = chunk()
-    real = real_rows(own, first_id=0)
-    assert real.root.tolist() == [0, 1, 4, 5, 6]
-    assert real.counts == [2, 3]
-    assert real.changes == {}
-    # Transition 0 for the goal that 1 achieved, and 5 and 6 for the one that 6 achieved.
-    source, goals = torch.tensor([0, 5, 6]), ROWS["next", "achieved_goal"][[1, 6, 6]]
-    virtual = virtual_rows(own, source, goals, first_id=0)
-    assert virtual.counts == [1, 2]
-    assert virtual.changes["desired_goal"][:, 0].tolist() == [2.0, 1003.0, 1003.0]
-    assert virtual.reward.tolist() == [-1.0, -1.0, 0.0]
-    assert own.keys.trajectory not in virtual.changes
-
-
 def test_whole_episodes_have_ids() -> None:
     """Two copies of the second episode: one up to its second state, one up to its end."""
     own = chunk(per="episode")
