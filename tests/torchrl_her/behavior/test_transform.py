@@ -10,12 +10,12 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.envs import SerialEnv, TransformedEnv
+from torchrl.envs import EnvBase, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_her import EnvKeys, GoalReward, GoalWeights, HERSampleUnit, HERWriter
 from torchrl_her.behavior import BehaviorGoals, DiscoverScore, GoalCandidates, GoalFactor, ValueCutoff
-from torchrl_her.goals import RareGoals
+from torchrl_her.goals import RareGoals, RewardFunction
 from torchrl_her.trainers import collector_state_dict, load_collector_state_dict
 
 from .line import WANTED, Line, walk
@@ -51,16 +51,23 @@ class Farther(GoalFactor):
         self.ends.append((ended.tolist(), achieved.tolist()))
 
 
-def made(num_envs: int = 2, *, runs: int = 1, line: dict[str, float] | None = None, **options: object):
+def made(base: int | EnvBase = 2, *, runs: int = 1, reward: RewardFunction = REWARD, **options: object):
+    """An environment, by default a line of so many, with behavior goals; and these."""
     generators = [torch.Generator().manual_seed(seed) for seed in range(runs)]
-    behavior = BehaviorGoals(
-        REWARD, runs=runs, generators=generators, **{"real_share": 0.0, "memory": 100} | options
-    )
-    return TransformedEnv(Line(num_envs, **line or {}), behavior), behavior  # type: ignore[arg-type]
+    options = {"real_share": 0.0, "memory": 100} | options
+    behavior = BehaviorGoals(reward, runs=runs, generators=generators, **options)  # type: ignore[arg-type]
+    return TransformedEnv(Line(base) if isinstance(base, int) else base, behavior), behavior
 
 
 def played(env: TransformedEnv, steps: int = 5) -> TensorDictBase:
     return env.rollout(steps, walk, break_when_any_done=False)
+
+
+def moved(env: TransformedEnv, steps: int, *, by: float) -> TensorDictBase:
+    """Steps after a reset and a move of all environments."""
+    first = env.reset()
+    env.base_env.place += by
+    return env.rollout(steps, walk, break_when_any_done=False, auto_reset=False, tensordict=first)
 
 
 def wanted(rows: TensorDictBase) -> list[list[float]]:
@@ -110,11 +117,9 @@ def test_a_goal_stays_while_others_begin_anew() -> None:
 
 
 def test_an_episode_that_misses_is_truncated_as_it_would_be() -> None:
-    env, behavior = made(1, weights=Told(3.0), line={"steps": 3})
+    env, behavior = made(Line(1, steps=3), weights=Told(3.0))
     played(env, 3)
-    first = env.reset()
-    env.base_env.place -= 5.0
-    rows = env.rollout(3, walk, break_when_any_done=False, auto_reset=False, tensordict=first)
+    rows = moved(env, 3, by=-5.0)
     assert rows["proposed"].all()
     assert rows["next", "truncated"].flatten().tolist() == [False, False, True]
     assert not rows["next", "terminated"].any()
@@ -123,33 +128,27 @@ def test_an_episode_that_misses_is_truncated_as_it_would_be() -> None:
 
 
 def test_the_tasks_goal_does_not_end_an_episode_with_another() -> None:
-    env, _ = made(1, weights=Told(2.0), continues_after_termination=True, line={"steps": 20})
+    env, _ = made(Line(1, steps=20), weights=Told(2.0), continues_after_termination=True)
     played(env, 11)  # the task's goal is achieved at 9, then two steps of the next episode
-    first = env.reset()
-    env.base_env.place += 7.0
-    rows = env.rollout(4, walk, break_when_any_done=False, auto_reset=False, tensordict=first)
+    rows = moved(env, 4, by=7.0)
     assert rows["next", "achieved_goal"].flatten().tolist() == [8.0, 9.0, 10.0, 11.0]
     assert not rows["next", "done"].any()
     assert rows["next", "reward"].flatten().tolist() == [-1.0] * 4
 
 
 def test_an_environment_that_cannot_go_on_truncates() -> None:
-    env, _ = made(1, weights=Told(2.0), line={"steps": 20})
+    env, _ = made(Line(1, steps=20), weights=Told(2.0))
     played(env, 11)
-    first = env.reset()
-    env.base_env.place += 7.0
-    rows = env.rollout(2, walk, break_when_any_done=False, auto_reset=False, tensordict=first)
+    rows = moved(env, 2, by=7.0)
     assert rows["next", "terminated"].flatten().tolist() == [False, False]
     assert rows["next", "truncated"].flatten().tolist() == [False, True]
     assert rows["next", "done"].flatten().tolist() == [False, True]
 
 
 def test_a_fall_is_one_whatever_the_goal() -> None:
-    env, _ = made(1, weights=Told(2.0), continues_after_termination=True, line={"edge": 3.5, "steps": 20})
+    env, _ = made(Line(1, edge=3.5, steps=20), weights=Told(2.0), continues_after_termination=True)
     played(env, 3)
-    first = env.reset()
-    env.base_env.place += 3.0
-    rows = env.rollout(1, walk, break_when_any_done=False, auto_reset=False, tensordict=first)
+    rows = moved(env, 1, by=3.0)
     assert rows["next", "terminated"].item()
     assert rows["next", "reward"].item() == -1.0
 
@@ -222,10 +221,9 @@ def test_a_run_does_not_depend_on_others() -> None:
         return torch.cat([played(env, 7)["desired_goal"] for _ in range(4)], 1)
 
     both, _ = made(6, runs=2, real_share=0.5, candidates=3)
-    alone = BehaviorGoals(
-        REWARD, real_share=0.5, candidates=3, memory=100, generators=[torch.Generator().manual_seed(1)]
-    )
-    assert torch.equal(goals(both)[3:], goals(TransformedEnv(Line(3), alone)))
+    alone, behavior = made(3, real_share=0.5, candidates=3)
+    behavior.generators = [torch.Generator().manual_seed(1)]
+    assert torch.equal(goals(both)[3:], goals(alone))
 
 
 def test_runs_that_take_no_part() -> None:
@@ -247,8 +245,7 @@ def test_stages_that_take_no_part() -> None:
     seen = line.observation_spec.clone()
     seen["stage"] = seen["observation"].to(torch.int64)
     line.observation_spec = seen
-    behavior = BehaviorGoals(REWARD, real_share=0.0, stage_key="stage", stage=1)
-    env = TransformedEnv(line, behavior)
+    env, behavior = made(line, stage_key="stage", stage=1)
     played(env)
     assert behavior.memory.sizes == [5]
     assert env.reset()["proposed"].flatten().tolist() == [False, True]
@@ -332,9 +329,7 @@ def test_actual_goals_are_those_of_the_task(part: str) -> None:
 
 
 def test_around_several_environments() -> None:
-    generator = torch.Generator().manual_seed(0)
-    behavior = BehaviorGoals(REWARD, real_share=0.0, weights=Told(3.0), generators=[generator])
-    env = TransformedEnv(SerialEnv(2, lambda: Line(1)), behavior)  # a batch of [2, 1]
+    env, _ = made(SerialEnv(2, lambda: Line(1)), weights=Told(3.0))  # a batch of [2, 1]
     played(env)
     assert played(env)["next", "desired_goal"].flatten().tolist() == [3.0] * 10
 
@@ -422,9 +417,7 @@ def test_a_success_counts_at_whatever_step_it_was() -> None:
         reward, _ = REWARD(achieved, desired)
         return reward, torch.zeros_like(reward, dtype=torch.bool)
 
-    generator = torch.Generator().manual_seed(0)
-    behavior = BehaviorGoals(lasting, weights=Told(2.0), real_share=0.0, generators=[generator])
-    env = TransformedEnv(Line(1), behavior)
+    env, behavior = made(1, reward=lasting, weights=Told(2.0))
     played(env)
     rows = played(env)
     assert rows["next", "reward"].flatten().tolist() == [-1.0, 0.0, -1.0, -1.0, -1.0]
@@ -440,29 +433,16 @@ def test_a_success_with_another_reward_is_no_fall() -> None:
             after = super()._step(tensordict)
             return after.set("reward", after["reward"] - 0.01)
 
-    generator = torch.Generator().manual_seed(0)
-    behavior = BehaviorGoals(
-        REWARD, weights=Told(2.0), real_share=0.0, generators=[generator], continues_after_termination=True
-    )
-    env = TransformedEnv(Costly(1, steps=20), behavior)
+    env, _ = made(Costly(1, steps=20), weights=Told(2.0), continues_after_termination=True)
     played(env, 3)
-    first = env.reset()
-    env.base_env.place += 8.0
-    rows = env.rollout(1, walk, break_when_any_done=False, auto_reset=False, tensordict=first)
+    rows = moved(env, 1, by=8.0)
     assert rows["next", "achieved_goal"].item() == WANTED
     assert not rows["next", "done"].any()
 
 
 def test_without_a_time_limit() -> None:
-    behavior = BehaviorGoals(
-        REWARD,
-        real_share=0.0,
-        weights=Told(2.0),
-        keys=EnvKeys(truncated=None),
-        continues_after_termination=True,
-        generators=[torch.Generator()],
-    )
-    env = TransformedEnv(Line(1, steps=1000), behavior)
+    options = {"keys": EnvKeys(truncated=None), "continues_after_termination": True}
+    env, _ = made(Line(1, steps=1000), weights=Told(2.0), **options)
     played(env, 10)
     env.reset()
     rows = played(env, 3)

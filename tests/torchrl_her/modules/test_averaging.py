@@ -72,15 +72,6 @@ def test_the_average_acts_like_the_policy() -> None:
     torch.testing.assert_close(average.module(seen.clone())["action"], actor(seen.clone())["action"])
 
 
-def test_buffers_are_copied() -> None:
-    policy = make_policy(0.0)
-    policy.register_buffer("seen", torch.zeros(()))
-    average = PolicyAverage(policy)
-    policy.seen.fill_(5.0)  # type: ignore[union-attr, operator]
-    average.follow()
-    assert float(average.module.seen) == 5.0
-
-
 def test_it_goes_on_from_its_state() -> None:
     policy = make_policy(0.0)
     average = PolicyAverage(policy)

@@ -55,11 +55,6 @@ def test_layers_of_the_critic() -> None:
     assert kinds(net) == ["StackedLinear", "ReLU"] * 3 + ["StackedLinear"]
 
 
-def test_width_of_the_hidden_layers() -> None:
-    assert layers(ActorNet(5, 2, shape=NetworkShape(hidden=8))) == [(5, 8), (8, 8), (8, 8), (8, 2)]
-    assert layers(CriticNet(5, 2, shape=NetworkShape(hidden=8))) == [(5, 8), (10, 8), (8, 8), (8, 1)]
-
-
 def test_the_action_enters_behind_the_critics_first_layer() -> None:
     net, first = CriticNet(11, 3), []
     net.first.register_forward_hook(lambda _module, _inputs, output: first.append(output))

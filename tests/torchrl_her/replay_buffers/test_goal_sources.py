@@ -17,8 +17,7 @@ from tensordict import TensorDict
 from torch import Tensor
 from torchrl.data import LazyTensorStorage, SliceSampler, TensorDictReplayBuffer
 
-from torchrl_her import GoalGrid, GoalReward, GoalWeights, HERSampleUnit, HERWriter, Instructiveness
-from torchrl_her.goals import GoalHistogram
+from torchrl_her import GoalReward, GoalWeights, HERSampleUnit, HERWriter
 
 from ..her_data import make_batch, tag
 
@@ -214,22 +213,6 @@ def test_virtual_rows_are_right_in_every_respect(
         assert not filtered or abs(paths[episode][t] - goal) >= 0.5
 
 
-def test_a_goal_of_another_episode_by_hand() -> None:
-    """The second episode passes 2, which the first one wanted."""
-    buffer = make_buffer(HERWriter, goal_sources={"actual": 1}, recent_actual=1)
-    buffer.extend(walks([[0.0, 1.0]], [2.0]))
-    buffer.writer.options = buffer.writer.options.changed({"recent_actual": 2})
-    buffer.extend(walks([[5.0, 3.0, 2.0, 4.0]], [2.0]))
-    rows = virtual(buffer)[1:]
-    order = rows["observation"][:, 0].argsort()
-    assert rows["desired_goal"][order].flatten().tolist() == [2.0, 2.0, 2.0]
-    after = rows["next"][order]
-    assert after["reward"].flatten().tolist() == [-1.0, 0.0, -1.0]
-    assert after["terminated"].flatten().tolist() == [False, True, False]
-    assert after["truncated"].flatten().tolist() == [False, False, True]
-    assert after["done"].flatten().tolist() == [False, True, True]
-
-
 def test_copies_of_whole_episodes_have_one_goal_of_another_episode() -> None:
     """The first episode wants 11, where the second one ends; the second wants 2, where both pass."""
     paths = [[0.0, 1.0, 2.0, 3.0], [10.0, 2.0, 11.0]]
@@ -362,24 +345,6 @@ def test_a_source_that_may_give_nothing_leaves_the_others_as_they_are() -> None:
     assert counts[1.0, 0.0] == 3
     assert sum(counts.values()) == 2 + 2 + 3
     assert counts[0.0, 0.0] == 0
-
-
-def test_the_histogram_of_ibs_counts_goals_of_all_sources_and_weighs_them() -> None:
-    grid = GoalGrid(0.0, 10.0, [10])
-    paths, wanted = [[0.5, 1.5, 2.5], [3.5, 4.5]], [8.5, 9.5]
-    counted = GoalHistogram(grid)
-    buffer = make_buffer(HERWriter, goal_sources=MIXED, weights=counted)
-    buffer.extend(walks(paths, wanted))
-    rows = virtual(buffer)["desired_goal"][:, 0]
-    assert torch.equal(counted.counts, rows.long().bincount(minlength=10))
-    assert counted.counts[8:].sum() == 2 * 3
-    target = torch.zeros(10)
-    target[9], target[:8] = 0.6, 0.05
-    ibs = Instructiveness(grid, lambda sigma: target, sigma=1.0, floor=0.0)
-    buffer = make_buffer(HERWriter, goal_sources={"future": 1, "actual": 5}, weights=ibs)
-    buffer.extend(walks(paths, wanted))
-    assert set(virtual(buffer)["desired_goal"][:, 0].tolist()) <= {1.5, 2.5, 4.5, 9.5}  # 8.5 has weight 0
-    assert ibs.counts[9] == 15
 
 
 # State

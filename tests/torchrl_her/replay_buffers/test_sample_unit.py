@@ -92,11 +92,6 @@ def flat(lengths: list[list[int]], **options: Any) -> TensorDict:
     return make_batch(lengths, **options).reshape(-1)
 
 
-def virtual_rows(buffer: TensorDictReplayBuffer, size: int = 2_000) -> TensorDict:
-    rows = buffer.sample(size)
-    return rows[rows["virtual"].squeeze(-1)]
-
-
 # Where goals come from
 
 

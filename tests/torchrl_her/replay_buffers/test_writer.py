@@ -471,9 +471,6 @@ def test_an_emptied_writer_is_as_new_but_for_its_totals() -> None:
 # Options
 
 
-NEXT = [("next", key) for key in ("achieved_goal", "desired_goal", "reward", "truncated", "done")]
-
-
 def test_without_virtual_rows_no_goals_are_needed() -> None:
     buffer = make_buffer(k=0)
     goals = ("achieved_goal", "desired_goal")
