@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from tensordict import TensorDict
 from torch import Tensor
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
-from torchrl_her import EnvReward, GoalReward, GoalWeights
+from torchrl_her import EnvReward, GoalReward, GoalWeights, HERWriter
 
 # The goal of state t of episode e of environment n is (1000 n + 100 e + t, 0): never equal to another.
 WANTED = -7.0
@@ -93,6 +96,18 @@ def same(one: TensorDict, other: TensorDict) -> bool:
     """Whether two tensordicts have the same entries, bit for bit."""
     keys = set(one.keys(True, True))
     return keys == set(other.keys(True, True)) and all(torch.equal(one[key], other[key]) for key in keys)
+
+
+def make_buffer(weights: GoalWeights | None, *, seed: int = 0, **options: Any) -> TensorDictReplayBuffer:
+    """A large buffer whose writer has weights of goals; goals are achieved within 0.01."""
+    writer = HERWriter(GoalReward(0.01), weights=weights, **options)
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(100_000), writer=writer, batch_size=4)
+    buffer.set_rng(torch.Generator().manual_seed(seed))
+    return buffer
+
+
+def virtual_goals(rows: TensorDict) -> Tensor:
+    return rows["desired_goal"][rows["virtual"].squeeze(-1)]
 
 
 def pairs(rows: TensorDict) -> set[tuple[float, float]]:

@@ -725,27 +725,22 @@ def test_an_input_that_was_stored_is_replaced() -> None:
 # Environments that cannot go on after an end of their own
 
 
-def wrap_ending(*stages: int, threshold: float = 0.5) -> TransformedEnv:
-    progress = at(make_three(threshold), *stages)
-    return TransformedEnv(
-        TinyEnv((2,)), StateToObs(progress.curriculum, progress, continues_after_termination=False)
-    )
-
-
-def test_an_end_of_the_environment_cuts_the_stage_s_episode_off() -> None:
+@pytest.mark.parametrize(
+    ("threshold", "terminated", "truncated"),
+    [(0.5, [False, False], [True, False]), (21.0, [True, True], [False, False])],  # 40 is 20 away from 20
+    ids=["cut off", "the stage's goal achieved as well"],
+)
+def test_an_end_of_the_environment_ends_the_stage_s_episode(
+    threshold: float, terminated: list[bool], truncated: list[bool]
+) -> None:
     """World 0 moves from 10 to 40, its own goal; the stage's goal is 20."""
-    after = act(wrap_ending(0), [30.0, 0.0])
-    assert after["terminated"].flatten().tolist() == [False, False]
-    assert after["truncated"].flatten().tolist() == [True, False]
-    assert after["done"].flatten().tolist() == [True, False]
-    assert after["reward"].flatten().tolist() == [-1.0, -1.0]
-
-
-def test_where_the_stage_s_goal_is_achieved_as_well_its_episode_is_terminated() -> None:
-    after = act(wrap_ending(0, threshold=21.0), [30.0, 0.0])  # 40 is 20 away from 20
-    assert after["terminated"].flatten().tolist() == [True, True]
-    assert after["truncated"].flatten().tolist() == [False, False]
-    assert after["reward"].flatten().tolist() == [0.0, 0.0]
+    progress = at(make_three(threshold), 0)
+    transform = StateToObs(progress.curriculum, progress, continues_after_termination=False)
+    after = act(TransformedEnv(TinyEnv((2,)), transform), [30.0, 0.0])
+    assert after["terminated"].flatten().tolist() == terminated
+    assert after["truncated"].flatten().tolist() == truncated
+    assert after["done"].flatten().tolist() == [True, threshold > 20]
+    assert after["reward"].flatten().tolist() == [float(own) - 1.0 for own in terminated]
 
 
 def test_an_end_needs_a_flag_to_be_noted_in() -> None:

@@ -13,15 +13,14 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
-from torchrl_her import GoalGrid, GoalReward, GoalWeights, HERWriter, Instructiveness, box_target
+from torchrl_her import GoalGrid, Instructiveness, box_target
 from torchrl_her.goals import GoalHistogram, kl_divergence
 from torchrl_her.goals.ibs import HistogramsOfRuns
 from torchrl_her.goals.weights import WeightsOfRuns
 
 from ..goal_grids import LINE, RIGHT, SCREEN
-from ..her_data import make_batch
+from ..her_data import make_batch, make_buffer, virtual_goals
 
 HALVES = GoalGrid(0.0, 1.0, [2])
 
@@ -245,13 +244,6 @@ def test_targets_that_are_no_distribution_over_the_grid_are_refused(q_star: Any)
 # In the writer
 
 
-def make_buffer(weights: GoalWeights | None, *, seed: int = 0, **options: Any) -> TensorDictReplayBuffer:
-    writer = HERWriter(GoalReward(0.01), weights=weights, **options)
-    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(100_000), writer=writer, batch_size=4)
-    buffer.set_rng(torch.Generator().manual_seed(seed))
-    return buffer
-
-
 def scattered(episodes: int, length: int = 20, *, seed: int = 0) -> Any:
     """Episodes that achieve goals anywhere on the screen, more often at its left."""
     batch = make_batch([[length]] * episodes)
@@ -259,11 +251,6 @@ def scattered(episodes: int, length: int = 20, *, seed: int = 0) -> Any:
     path[..., 0].square_()
     batch["achieved_goal"], batch["next", "achieved_goal"] = path[:, :-1].clone(), path[:, 1:].clone()
     return batch
-
-
-def virtual_goals(buffer: TensorDictReplayBuffer) -> Tensor:
-    rows = buffer[:]
-    return rows["desired_goal"][rows["virtual"].squeeze(-1)]
 
 
 def test_goals_are_written_as_their_weights_say() -> None:
@@ -274,7 +261,7 @@ def test_goals_are_written_as_their_weights_say() -> None:
     weights = Instructiveness(grid, quarters, sigma=0.2)
     buffer = make_buffer(weights, strategy="episode", k=4)
     buffer.extend(batch)
-    share = (virtual_goals(buffer)[:, 0] > 0.5).float().mean()
+    share = (virtual_goals(buffer[:])[:, 0] > 0.5).float().mean()
     assert float(share) == pytest.approx(0.75, abs=0.02)  # six standard deviations
     assert weights.counts.tolist() == [int((1 - share) * 16_000 + 0.5), int(share * 16_000 + 0.5)]
 
@@ -289,7 +276,7 @@ def test_ibs_writes_goals_nearer_to_the_target_than_her() -> None:
             buffer.extend(scattered(100, seed=epoch))
             if isinstance(weights, Instructiveness):
                 weights.step()
-        goals = virtual_goals(buffer)
+        goals = virtual_goals(buffer[:])
         assert torch.equal(weights.counts, SCREEN.cell(goals).bincount(minlength=400))
         inside = ((goals > torch.tensor([0.55, 0.2])) & (goals < torch.tensor([0.95, 0.8]))).all(-1)
         share.append(float(inside.float().mean()))
@@ -306,7 +293,8 @@ def test_a_goal_that_moves_nowhere_and_starts_in_the_box_does_not_crowd_out_the_
     for _ in range(3):
         buffer.extend(batch)
     assert float(weights(torch.tensor([0.75, 0.75]))) == pytest.approx(0.002 * float(weights.q_star.max()))
-    assert len(virtual_goals(buffer)) == 3 * 100 * 20 * 4  # nothing else was on offer: the floor lets it in
+    # Nothing else was on offer: the floor lets it in.
+    assert len(virtual_goals(buffer[:])) == 3 * 100 * 20 * 4
 
 
 def test_the_writer_carries_q_and_sigma() -> None:

@@ -11,14 +11,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 from torchrl_her import (
     CurriculumStage,
     GoalGrid,
-    GoalReward,
-    GoalWeights,
-    HERWriter,
     Instructiveness,
     box_target,
     enter_stage,
@@ -27,7 +23,7 @@ from torchrl_her.curriculum import set_stage_goals
 from torchrl_her.goals import KernelInstructiveness
 from torchrl_her.trainers import load_checkpoint, save_checkpoint
 
-from ..her_data import make_batch
+from ..her_data import make_batch, make_buffer, virtual_goals
 
 PAIR = torch.tensor([[0.0], [2.0]])
 
@@ -254,13 +250,6 @@ def in_15_dimensions(episodes: int, *, seed: int) -> Any:
     return batch
 
 
-def make_buffer(weights: GoalWeights | None) -> TensorDictReplayBuffer:
-    writer = HERWriter(GoalReward(0.01), weights=weights)
-    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(100_000), writer=writer, batch_size=4)
-    buffer.set_rng(torch.Generator().manual_seed(0))
-    return buffer
-
-
 def test_the_writer_prefers_goals_near_the_real_ones_in_15_dimensions() -> None:
     real = 0.8 + 0.1 * torch.randn(500, 15, generator=torch.Generator().manual_seed(0))
     judge = KernelInstructiveness(real, sigma=0.2)
@@ -272,8 +261,7 @@ def test_the_writer_prefers_goals_near_the_real_ones_in_15_dimensions() -> None:
             buffer.extend(in_15_dimensions(50, seed=epoch))
             if weights is not None:
                 weights.step()
-        rows = buffer[:]
-        goals = rows["desired_goal"][rows["virtual"].squeeze(-1)]
+        goals = virtual_goals(buffer[:])
         shares.append(float(((goals.mean(-1) - 0.8).abs() < 0.15).float().mean()))
         judge.clear()
         judge.update(goals)

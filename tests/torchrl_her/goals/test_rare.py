@@ -1,8 +1,9 @@
-"""InverseDensity goals weigh more: by hand, for any goals, after resuming, and in the writer."""
+"""Rare goals weigh more: by hand, for any goals, after resuming, and in the writer; novel ones too."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -13,12 +14,12 @@ from torch import Tensor
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 from torchrl_her import GoalReward, GoalWeights, HERSampleUnit, HERWriter
-from torchrl_her.goals import RareGoals
+from torchrl_her.goals import NetworkNovelty, RareGoals
 from torchrl_her.goals.weights import spread_evenly
 from torchrl_her.replay_buffers.runs import RunsSampler
 from torchrl_her.trainers import load_checkpoint, save_checkpoint
 
-from ..her_data import make_batch
+from ..her_data import make_batch, make_buffer, virtual_goals
 
 ESTIMATORS = ("kernel", "neighbors")
 
@@ -135,30 +136,28 @@ def test_densities_are_estimated_from_some_of_the_memory() -> None:
 
 
 NUMBERS = st.floats(width=32) | st.floats(-3.0, 3.0, width=32)
+GOALS = st.lists(st.tuples(NUMBERS, NUMBERS), max_size=15)
 
 
-@settings(max_examples=80, deadline=None)
-@given(
-    st.lists(st.tuples(NUMBERS, NUMBERS), max_size=20),
-    st.lists(st.tuples(NUMBERS, NUMBERS), max_size=20),
-    st.sampled_from(ESTIMATORS),
-    st.floats(0.01, 10.0),
-    st.floats(1.001, 1e30),
-)
+@pytest.mark.parametrize("kind", [*ESTIMATORS, "novel"])
+@settings(max_examples=40, deadline=None)
+@given(known=GOALS, asked=GOALS, sharpness=st.floats(0.01, 10.0), limit=st.floats(1.001, 1e30))
 def test_weights_are_finite_and_only_goals_that_are_not_have_none(
+    kind: Any,
     known: list[tuple[float, float]],
     asked: list[tuple[float, float]],
-    estimator: Any,
     sharpness: float,
     limit: float,
 ) -> None:
-    weights = RareGoals(estimator=estimator, sharpness=sharpness, limit=limit, memory=7, samples=5, k=3)
+    weights: Any = NetworkNovelty(sharpness=sharpness, hidden=8, features=4)
+    if kind != "novel":
+        weights = RareGoals(estimator=kind, sharpness=sharpness, limit=limit, memory=7, samples=5, k=3)
+    seen, goals = (torch.tensor(points).view(-1, 2) for points in (known, asked))
     for _ in range(2):
-        weights.update(torch.tensor(known).view(-1, 2))
-        goals = torch.tensor(asked).view(-1, 2)
+        weights.update(seen)
         weight = weights(goals)
         assert bool(weight.isfinite().all())
-        if weights.goals is not None:
+        if seen.isfinite().all(-1).any():
             finite = goals.isfinite().all(-1)
             assert torch.equal(weight > 0, finite)
             assert not finite.any() or float(weight.max()) == 1.0
@@ -225,10 +224,10 @@ def test_a_state_is_a_copy() -> None:
 # In the writer and when sampling
 
 
-def corners(episodes: int) -> Any:
+def corners(episodes: int, *, seed: int = 0) -> Any:
     """Episodes that stay at the origin but for one step in ten, which is at (1, 1)."""
     batch = make_batch([[10]] * episodes)
-    path = 0.02 * random(episodes, 11, 2)
+    path = 0.02 * random(episodes, 11, 2, seed=seed)
     path[:, 5] += 1.0
     batch["achieved_goal"], batch["next", "achieved_goal"] = path[:, :-1].clone(), path[:, 1:].clone()
     return batch
@@ -238,24 +237,17 @@ def share_of_rare(goals: Tensor) -> float:
     return float((goals[:, 0] > 0.5).float().mean())
 
 
-def make_buffer(weights: GoalWeights | None, *, seed: int = 0) -> TensorDictReplayBuffer:
-    writer = HERWriter(GoalReward(0.01), strategy="episode", weights=weights)
-    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(100_000), writer=writer, batch_size=4)
-    buffer.set_rng(torch.Generator().manual_seed(seed))
-    return buffer
-
-
-@pytest.mark.parametrize("estimator", ESTIMATORS)
-def test_rare_goals_are_written_more_often(estimator: Any) -> None:
+@pytest.mark.parametrize(
+    "make", [RareGoals, lambda: RareGoals(estimator="neighbors"), NetworkNovelty], ids=[*ESTIMATORS, "novel"]
+)
+def test_rare_goals_are_written_more_often(make: Callable[[], GoalWeights]) -> None:
     shares = []
-    for weights in (None, RareGoals(estimator=estimator)):
-        buffer = make_buffer(weights)
-        buffer.extend(corners(20))
-        old = len(buffer)
-        for _ in range(5):
-            buffer.extend(corners(20))
-        rows = buffer[old:]
-        shares.append(share_of_rare(rows["desired_goal"][rows["virtual"].squeeze(-1)]))
+    for weights in (None, make()):
+        buffer = make_buffer(weights, strategy="episode")
+        for seed in range(12):
+            buffer.extend(corners(20, seed=seed))
+        late = buffer[len(buffer) // 6 :]  # before, weights knew little
+        shares.append(share_of_rare(virtual_goals(late)))
     assert shares[0] == pytest.approx(0.1, abs=0.02)
     assert shares[1] > 1.5 * shares[0]
 
@@ -271,8 +263,7 @@ def test_rare_goals_are_sampled_more_often() -> None:
         )
         buffer.extend(corners(20).reshape(-1).exclude("state"))
         sampled = torch.cat([buffer.sample() for _ in range(10)])
-        virtual = sampled["virtual"].squeeze(-1)
-        shares.append(share_of_rare(sampled["desired_goal"][virtual]))
+        shares.append(share_of_rare(virtual_goals(sampled)))
     assert shares[1] > 2.0 * shares[0]
 
 
@@ -292,7 +283,7 @@ def test_each_of_several_runs_has_a_memory_of_its_own() -> None:
     assert second is not None
     assert len(first) == len(second) == 2 * 4 * 10 * 4
     assert float(first.max()) < 10.0 < float(second.min())
-    single = make_buffer(RareGoals(), seed=0)
+    single = make_buffer(RareGoals(), strategy="episode")
     for _ in range(2):
         single.extend(batch[:4])
     torch.testing.assert_close(single.writer.weights.goals, first)

@@ -7,16 +7,10 @@ from typing import Any
 
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from torch import Tensor, nn
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
-from torchrl_her import GoalReward, HERWriter
 from torchrl_her.goals import NetworkNovelty
 from torchrl_her.trainers import load_checkpoint, save_checkpoint
-
-from ..her_data import make_batch
 
 
 def uniform(n: int, g: int = 2, *, low: float = -1.0, high: float = 1.0, seed: int = 0) -> Tensor:
@@ -112,30 +106,6 @@ def test_it_learns_where_gradients_are_off() -> None:
         assert taught(weights, uniform(100), 20).error(uniform(100)).mean() < 0.7 * before
 
 
-NUMBERS = st.floats(width=32) | st.floats(-3.0, 3.0, width=32)
-
-
-@settings(max_examples=40, deadline=None)
-@given(
-    st.lists(st.tuples(NUMBERS, NUMBERS), max_size=10),
-    st.lists(st.tuples(NUMBERS, NUMBERS), max_size=10),
-    st.floats(0.01, 10.0),
-)
-def test_weights_are_finite_and_only_goals_that_are_not_have_none(
-    known: list[tuple[float, float]], asked: list[tuple[float, float]], sharpness: float
-) -> None:
-    weights = NetworkNovelty(sharpness=sharpness, hidden=8, features=4)
-    for _ in range(2):
-        weights.update(torch.tensor(known).view(-1, 2))
-        goals = torch.tensor(asked).view(-1, 2)
-        weight = weights(goals)
-        assert bool(weight.isfinite().all())
-        if weights._learned is not None:
-            finite = goals.isfinite().all(-1)
-            assert torch.equal(weight > 0, finite)
-            assert not finite.any() or float(weight.max()) == 1.0
-
-
 def test_emptying_starts_again_and_takes_goals_of_any_width() -> None:
     weights, fresh = taught(NetworkNovelty(), uniform(50), 5), NetworkNovelty()
     with pytest.raises(ValueError, match="goals of 2 numbers were learned, got goals of 3"):
@@ -183,23 +153,3 @@ def test_it_goes_on_as_it_was_saved(tmp_path: Any) -> None:
 def test_bad_options_are_named(options: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         NetworkNovelty(**options)
-
-
-def test_novel_goals_are_written_more_often() -> None:
-    shares = []
-    for weights in (None, NetworkNovelty()):
-        writer = HERWriter(GoalReward(0.01), strategy="episode", weights=weights)
-        buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(100_000), writer=writer, batch_size=4)
-        buffer.set_rng(torch.Generator().manual_seed(0))
-        old = 0
-        for seed in range(12):
-            old = len(buffer) if seed == 2 else old
-            batch = make_batch([[10]] * 20)
-            path = 0.02 * torch.randn(20, 11, 2, generator=torch.Generator().manual_seed(seed))
-            path[:, 5] += 1.0  # one step in ten is far from the others
-            batch["achieved_goal"], batch["next", "achieved_goal"] = path[:, :-1].clone(), path[:, 1:].clone()
-            buffer.extend(batch)
-        rows = buffer[old:]
-        shares.append(float((rows["desired_goal"][rows["virtual"].squeeze(-1)][:, 0] > 0.5).float().mean()))
-    assert shares[0] == pytest.approx(0.1, abs=0.02)
-    assert shares[1] > 1.5 * shares[0]
