@@ -102,7 +102,7 @@ def make_stages() -> CurriculumProgress:
 
 
 def make_staged_env(progress: CurriculumProgress, num_envs: int, seed: int) -> EnvBase:
-    """Returns environments whose observation and goals are those of the present stage.
+    """Returns environments that show the observation and goals of the present stage.
 
     ``StateToObs`` reads observation and goals from the state, and rewards the stage's goal. ``ZeroPad``
     writes ``input``, where an entry has the same place in all stages; unused entries are 0.

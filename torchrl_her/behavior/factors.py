@@ -107,7 +107,7 @@ class Successes:
         self.rate = torch.full((runs,), start, dtype=torch.float64)
 
     def record(self, ended: Tensor, achieved: Tensor) -> None:
-        """Counts [R] episodes that ended, and those of them in which the goal was achieved."""
+        """Counts ended episodes [R], and [R] of these in which the goal was achieved."""
         kept = torch.exp(-ended.double() / self.memory)
         self.rate = kept * self.rate.to(kept.device) + (1 - kept) * achieved / ended.clamp(min=1)
 

@@ -124,7 +124,7 @@ class AchievedGoals:
         written, capacity = state["written"], state["capacity"]
         if (len(written), capacity) != (self.runs, self.capacity):
             raise ValueError(
-                f"the state must be that of {self.runs} runs with {self.capacity} goals each, got one of "
+                f"the state must be of {self.runs} runs with {self.capacity} goals each, got one of "
                 f"{len(written)} runs with {capacity}"
             )
         self._written, self._rows = written.clone(), None

@@ -34,7 +34,7 @@ class BehaviorGoals(Transform):
 
     where ``weight`` says how useful a goal is, as for virtual goals. The factors say how well the goal can be
     achieved from the episode's start, and how far it leads to the task's goal. The episode's reward,
-    terminated and done are then those of the proposed goal. All other episodes keep the task's own goal.
+    terminated and done are then computed for the proposed goal. All other episodes keep the task's own goal.
     Leave this transform out of environments for evaluation.
 
     | method | weights | update_on | factors | greedy |
@@ -178,7 +178,7 @@ class BehaviorGoals(Transform):
         """Restores the state that :meth:`get_extra_state` returned.
 
         Raises:
-            ValueError: it is that of another number of runs, or of other weights and factors.
+            ValueError: the state is of another number of runs, or of other weights and factors.
         """
         self.memory.load_state_dict(state["memory"])
         parts: dict[str, Sequence[GoalWeights | GoalFactor]]

@@ -20,7 +20,7 @@ Prepare = Callable[[TensorDictBase], TensorDictBase]
 class GoalValues:
     """Computes the values [m, c, E] that E critics give to candidate goals, from the first observations.
 
-    The value is that of the greedy action. With rewards of -1 until the goal is achieved, a goal that takes d
+    Values are of greedy actions. With rewards of -1 until the goal is achieved, a goal that takes d
     steps has the value -(1 - gamma^d) / (1 - gamma).
 
     Args:

@@ -120,7 +120,7 @@ class Curriculum:
     as wide as the last stage's. Goals that have fewer entries than the last stage's have zeros behind them.
     Order the state so that a stage's inputs, its observation and then its desired goal, are the first inputs
     of the next stage. Inputs then keep their meaning, and what was learned carries over: in the hand tasks
-    the stage of reaching has the inputs [hand | ball], that of throwing [hand | ball | speed | black hole].
+    the inputs are [hand | ball] for reaching and [hand | ball | speed | black hole] for throwing.
 
     Args:
         stages: stages in the order of training, one or more.
@@ -132,8 +132,8 @@ class Curriculum:
     Attributes:
         stages: the stages, with indices in place of names and of constant goals.
         appended: the zero and the constant goals that :meth:`extend` puts behind a state.
-        observation_width, goal_width: widths of observations and goals in all stages: those of the last
-            stage, as shorter ones are followed by zeros.
+        observation_width, goal_width: widths of observations and goals in all stages: the widths of the
+            last stage, as shorter ones are followed by zeros.
         input_width: width of the network's input.
         first_inputs: number of inputs that the first stage uses; they are the leading ones.
         state_index: [stages, observation_width + 2 * goal_width], indices of observation, achieved and
@@ -244,8 +244,8 @@ class Curriculum:
         for key, widest in (("observation", self.observation_width), ("achieved_goal", self.goal_width)):
             if (width := len(getattr(stage, key))) > widest:
                 raise ValueError(
-                    f"stage {stage.name!r}: {key} has {width} entries, but may have no more than that of the "
-                    f"last stage, {last.name!r}, which has {widest}"
+                    f"stage {stage.name!r}: {key} has {width} entries, but may have at most {widest}, "
+                    f"as in the last stage, {last.name!r}"
                 )
 
     def _state_index(self, stage: CurriculumStage) -> list[Any]:
@@ -257,7 +257,7 @@ class Curriculum:
         return [index for goal in goals for index in self.padded(goal, self.goal_width)]
 
     def padded(self, indices: Indices, width: int) -> list[Any]:
-        """Returns indices into the extended state, and those of zeros behind them up to a width."""
+        """Returns indices into the extended state, followed by indices of zeros up to a width."""
         return [*indices, *[self.state_width] * (width - len(indices))]
 
     def _input_index(self, stage: CurriculumStage) -> list[int]:

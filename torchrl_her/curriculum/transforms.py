@@ -70,7 +70,7 @@ class _StageTransform(Transform):
         return stages[:1] if stages.count(stages[0]) == len(stages) else stages
 
     def _rows_stages(self, tensordict: TensorDictBase) -> Tensor | None:
-        """Returns the stage [...] that each row carries; None if stages are those of runs."""
+        """Returns the stage [...] that each row carries; None if each run has one stage."""
         if not self.progress.by_episode:
             return None
         return self._get(tensordict, self.stage_key, 1).squeeze(-1)
@@ -79,8 +79,8 @@ class _StageTransform(Transform):
         """Returns the columns [B, n] of the stages of B blocks, or of rows that carry their stages.
 
         Args:
-            columns: [stages, n], those of each stage.
-            rows: stages [...] of the rows; None if stages are those of runs.
+            columns: [stages, n], the columns of each stage.
+            rows: stages [...] of the rows; None if each run has one stage.
             device: device of the result.
         """
         stages = self._stages() if rows is None else tuple(range(len(self.curriculum)))

@@ -127,7 +127,7 @@ class Demonstrations:
             lengths: [e] int64, which sum to m.
 
         Keyword Args:
-            rows: [n], transitions to take from; None for those of the demonstrations.
+            rows: [n], transitions to take from; None for the demonstrations' own.
         """
         states = None if self.states is None else {name: entry[index] for name, entry in self.states.items()}
         rows_taken = (self.rows if rows is None else rows)[index]
@@ -185,7 +185,7 @@ class Demonstrations:
 
     @classmethod
     def join(cls, parts: Sequence[Demonstrations]) -> Demonstrations:
-        """Joins the episodes of several demonstrations, in order; task and origin are those of the first."""
+        """Joins the episodes of several demonstrations, in order; task and origin are the first one's."""
         states = None
         if parts[0].states is not None:
             states = {

@@ -61,7 +61,7 @@ class MixedReplay:
     by their mean within each part, so that demonstrations with a share of the rows have that share of the
     weight. New priorities go to the buffer that a row came from.
 
-    Transitions are written into the buffer of collected ones; writer and size are those of that buffer. A
+    Transitions are written into the buffer ``collected``, whose writer and size this object has. A
     :class:`~torchrl_her.Trainer` takes this object in place of a buffer.
 
     Nair et al., Overcoming exploration in reinforcement learning with demonstrations, 2018 (arXiv
@@ -78,7 +78,7 @@ class MixedReplay:
 
     Raises:
         ValueError: the share is not between 0 and 1, a batch has no room for both, or the buffers are for
-            different numbers of runs; when sampling, the number of rows is not that of whole batches.
+            different numbers of runs; when sampling, the rows are not whole batches.
 
     Example:
         >>> from tensordict import TensorDict
@@ -102,7 +102,8 @@ class MixedReplay:
     ) -> None:
         if runs_of(collected) != runs_of(demonstrations):
             raise ValueError(
-                f"buffers must have equally many runs, got {runs_of(collected)} and {runs_of(demonstrations)}"
+                "buffers must have the same number of runs, got "
+                f"{runs_of(collected)} and {runs_of(demonstrations)}"
             )
         self.collected, self.demonstrations = collected, demonstrations
         self.runs, self.batch_size = runs_of(collected), batch_size

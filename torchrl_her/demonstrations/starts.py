@@ -20,10 +20,10 @@ class DemonstrationStarts(Transform):
 
     At first episodes start a few steps before the end of a demonstration, so that the goal is near. When
     enough of them achieve it, starts walk back, see :class:`~torchrl_her.demonstrations.WalkBack`. Such an
-    episode has as many steps as any other. All other episodes start as the environment starts them.
+    episode has the usual number of steps. All other episodes start as the environment starts them.
 
-    The environment below must have a method ``start_at(states, which)``, as those of this library's throwing
-    and toy tasks have (:meth:`torchrl_her_envs.BatchedEnv.start_at`). Put the transform first, right around
+    The environment below must have a method ``start_at(states, which)``, as this library's throwing and toy
+    tasks have (:meth:`torchrl_her_envs.BatchedEnv.start_at`). Put the transform first, right around
     it. If a later transform changes what ends an episode, as :class:`~torchrl_her.StateToObs` does, put
     :meth:`outcomes` behind that one.
 
@@ -85,7 +85,7 @@ class DemonstrationStarts(Transform):
         self._asks_elsewhere = False
 
     def show(self, demonstrations: Demonstrations, *, run: int = 0) -> None:
-        """Replaces the demonstrations of a run, as by those of its next stage, and restarts its walk."""
+        """Replaces the demonstrations of a run, for instance at its next stage, and restarts its walk."""
         self._shown[run] = usable(demonstrations)
         self.walk.restart(run, int(self._shown[run].lengths.max()))
 

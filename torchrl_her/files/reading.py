@@ -141,7 +141,7 @@ def _check_description(description: bytes) -> None:
         MoreThanDataError: it names something else.
         ValueError: it is damaged, or too large with all tuples written in full.
     """
-    stack: list[int] = []  # sizes of values; a tuple's is that of all of its entries
+    stack: list[int] = []  # sizes of values; the size of a tuple is the sum over its entries
     marks: list[int] = []
     memo: dict[Any, int] = {}
     steps = 0

@@ -1,7 +1,7 @@
 """Draws goals for transitions from lists of candidates, in proportion to candidate times weight times filter.
 
-A line is a list of goals: those of an episode, or those of a pool that many transitions share. A transition
-may take its goal from the part of a line that the strategy allows.
+A line is a list of goals, of an episode or of a pool that many transitions share. A transition may take its
+goal from the part of a line that the strategy allows.
 """
 
 from __future__ import annotations
@@ -58,9 +58,10 @@ def choose_goals(
 ) -> tuple[Tensor, Tensor]:
     """Draws k goals for each transition, with replacement, by candidate times weight times filter.
 
-    To save work, goals are proposed by candidate and weight alone. Those that the filter refuses are proposed
-    again, ``tries`` times. If a transition still has one that is refused, all its k goals are drawn again,
-    from the likelihoods of all its candidates. The result follows the product of the three factors.
+    To save work, goals are proposed by candidate and weight alone. Goals that the filter refuses are replaced
+    by new proposals, up to ``tries`` times. If a transition still has a refused goal, all its k goals are
+    drawn again, from the likelihoods of all its candidates. The result follows the product of the three
+    factors.
 
     Args:
         candidates: candidates of n transitions.

@@ -81,8 +81,8 @@ def _uniform(shape: tuple[int, ...], dtype: torch.dtype, device: torch.device, s
 def draw_uniformly(first: Tensor, end: Tensor, k: int, *, generator: Randomness = None) -> Tensor:
     """Draws k goals for each transition, with replacement, all of its candidates being equally likely.
 
-    The result is that of :func:`~torchrl_her.goals.draw` from a table of candidates. No table is made, as it
-    would be as large as the number of transitions times the horizon.
+    The goals are distributed as :func:`~torchrl_her.goals.draw` draws them from a table of candidates. No
+    table is made, as its size would be the number of transitions times the horizon.
 
     Args:
         first: [...] int64, the first candidate.
@@ -106,8 +106,8 @@ def draw_weighted(
 ) -> Tensor:
     """Draws k goals for each transition, with replacement, in proportion to the goals' weights.
 
-    The result is that of :func:`~torchrl_her.goals.draw` from a table of the candidates' weights. No table is
-    made: all transitions of an episode look up their draws in the same running sum.
+    The goals are distributed as :func:`~torchrl_her.goals.draw` draws them from a table of the candidates'
+    weights. No table is made: all transitions of an episode look up their draws in the same running sum.
 
     Args:
         weight: [..., T], at least 0, of each goal of an episode.

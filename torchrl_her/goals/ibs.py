@@ -94,8 +94,8 @@ class GoalHistogram(GoalWeights):
 class Instructiveness(InstructiveWeights, GoalHistogram):
     """The weights of IBS: max(q* - q, floor) in a goal's cell. Equations 4.5 and 4.9.
 
-    The schedule of the kernel's sigma is that of :class:`~torchrl_her.goals.InstructiveWeights`. For goals
-    of more dimensions than a grid can hold there is :class:`~torchrl_her.goals.KernelInstructiveness`.
+    See :class:`~torchrl_her.goals.InstructiveWeights` for the schedule of the kernel's sigma. A grid is too
+    large for goals of many dimensions: use :class:`~torchrl_her.goals.KernelInstructiveness` for them.
 
     Args:
         grid: cells over the range of achieved goals.

@@ -21,10 +21,10 @@ _GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
 class KernelInstructiveness(InstructiveWeights):
     """The weights of IBS, max(q* - q, floor), by kernel densities in place of a grid. Equations 4.5 and 4.9.
 
-    q* is the kernel density of the real goals, q that of the virtual goals that were written since the
-    buffer was last emptied, with the same kernel. Weights are given in units of the largest q* of a real
-    goal. The schedule of sigma is that of :class:`~torchrl_her.Instructiveness`. But both densities are
-    smooth here, so that a virtual goal raises q around itself and not in its cell.
+    q* is the kernel density of the real goals, and q the kernel density of the virtual goals that were
+    written since the buffer was last emptied, with the same kernel. Weights are in units of the largest q*
+    of a real goal. Sigma has the schedule of :class:`~torchrl_her.Instructiveness`. Both densities are
+    smooth, so a virtual goal raises q around itself and not in a cell.
 
     Goals that are not finite have weight 0.
 

@@ -28,8 +28,8 @@ class RewardFunction(Protocol):
     The achieved goal comes first, as in gymnasium's ``compute_reward``. A function that has an attribute
     ``info_keys`` gets a third argument, the info: a tensordict of these entries of the transition, whose
     dimensions [...] are broadcast against those of the goals. Entries are read under ``next``, or in the root
-    if ``next`` lacks them, as it lacks ``action``. The filter, which asks about the state before the action,
-    looks in the root first.
+    if ``next`` lacks them, as it lacks ``action``. The filter needs the reward before the action, and looks
+    in the root first.
     """
 
     def __call__(self, achieved_goal: Tensor, desired_goal: Tensor, /) -> tuple[Tensor, Tensor]: ...
@@ -260,7 +260,7 @@ def _checked(reward: Tensor, shape: torch.Size) -> Tensor:
 def missed(
     reward_fn: RewardFunction, achieved: Outcome, desired_goal: Tensor, achieved_reward: float
 ) -> Tensor:
-    """Returns where the reward is below that of an achieved goal: [...] of bool, for goals [..., g].
+    """Returns where the reward is below the reward of an achieved goal: [...] of bool, for goals [..., g].
 
     ``terminated`` is half of the work and not needed, so it is not computed where that can be avoided.
 

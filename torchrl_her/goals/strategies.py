@@ -104,7 +104,7 @@ def strategy_name(strategy: Strategy) -> str:
 def candidate_range(strategy: Strategy, time: Tensor, lengths: Tensor) -> tuple[Tensor, Tensor]:
     """Returns the first candidate of each transition, and the end of its candidates.
 
-    A candidate is a transition t' of the same episode. Its achieved goal is that of the state it leads
+    A candidate is a transition t' of the same episode. Its achieved goal is read from the state it leads
     to, so with ``"future"`` (t' >= t) no candidate was achieved before the action. Andrychowicz et al.,
     Hindsight Experience Replay, 2017, section 4.5.
 

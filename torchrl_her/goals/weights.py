@@ -109,7 +109,7 @@ def checked_weights(weight: Tensor, goals: Tensor) -> Tensor:
     """Computes weights [...] of goals [..., g] as floating-point numbers, and checks them.
 
     Raises:
-        ValueError: the number of weights is not that of the goals, or some are negative or not finite.
+        ValueError: the numbers of weights and goals differ, or some weights are negative or not finite.
     """
     if weight.shape != goals.shape[:-1]:
         raise ValueError(

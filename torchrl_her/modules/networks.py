@@ -55,10 +55,10 @@ class StackedLinear(nn.Module):
 class StackedBatchNorm(nn.Module):
     """Batch normalization in which each run has its own statistics.
 
-    In the critic's own loss, where weights learn, a batch is normalized by its own statistics and moves the
-    running ones. In target networks, in the actor's loss and in evaluation mode, the running statistics are
-    used and stay. With those of the batch, an actor could hardly raise the mean of the values, since
-    normalization takes it out.
+    In the critic's loss, where its weights learn, a batch is normalized by its own statistics, and updates
+    the running statistics. Target networks, the actor's loss and evaluation mode use the running statistics
+    and do not change them. By a batch's own statistics, normalization would remove the mean of the values,
+    which the actor has to raise.
 
     Args:
         width: Width of the input.
@@ -280,7 +280,7 @@ def stacked_runs(module: nn.Module) -> int:
 
 
 def stack_runs(states: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:
-    """Stacks the state dicts of single networks to that of a stacked network.
+    """Stacks state dicts of single networks into the state dict of a stacked network.
 
     Args:
         states: ``state_dict()`` of R networks of the same shape, each of a single run.
@@ -297,7 +297,7 @@ def stack_runs(states: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:
 
 
 def take_run(state: Mapping[str, Tensor], run: int, runs: int) -> dict[str, Tensor]:
-    """Extracts the state dict of one run's network from that of a stacked network.
+    """Extracts the state dict of one run's network from the state dict of a stacked network.
 
     Args:
         state: ``state_dict()`` of the stacked network.

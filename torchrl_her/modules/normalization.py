@@ -1,6 +1,6 @@
 """Running normalization: gives each input of networks about mean 0 and standard deviation 1.
 
-Statistics are those of all transitions that were written, virtual ones included. Andrychowicz et al.,
+The statistics are of all transitions that were written, virtual ones included. Andrychowicz et al.,
 Hindsight experience replay, 2017, appendix A.
 """
 
@@ -90,8 +90,8 @@ class RunningNorm(nn.Module):
     nothing.
 
     R independent runs have statistics of their own; batches are R equal blocks, in the order of the runs.
-    ``state_dict`` holds all statistics, as does that of a policy with this normalization. Each coordinate is
-    normalized by itself, so concatenated entries have the concatenated statistics.
+    ``state_dict`` holds all statistics; so does the ``state_dict`` of a policy with this normalization. Each
+    coordinate is normalized by itself, so concatenated entries have the concatenated statistics.
 
     Args:
         widths: widths of the entries that are normalized, by their keys.

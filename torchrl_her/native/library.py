@@ -62,7 +62,7 @@ def load_library(source: str, *, headers: Sequence[str] = (), real: str = "float
     """Returns the library of a C++ source of this package.
 
     It is compiled for this processor the first time, which takes some seconds, and kept in the user's cache:
-    the folder that ``TORCHRL_HER_CACHE`` names, or ``torchrl_her`` in that of ``XDG_CACHE_HOME``. The
+    the folder that ``TORCHRL_HER_CACHE`` names, or ``torchrl_her`` in ``XDG_CACHE_HOME``. The
     compiler is ``CXX`` from the environment, or else g++, clang++ or c++. Without a compiler, the wheel's
     library for such processors is loaded, or else the package ``ziglang`` compiles.
 

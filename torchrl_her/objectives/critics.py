@@ -93,7 +93,7 @@ def least_of_some(values: Tensor, count: int, noise: RunNoise) -> Tensor:
     """Returns the least value of all critics, or of some that are drawn at random for each run.
 
     Args:
-        values: [N, ...] of N critics; those of a critic are one equal block for each run.
+        values: [N, ...], the values of N critics, each of which has one equal block for each run.
         count: number of critics that are drawn; 0 for all of them.
         noise: draws the critics, if ``count`` is not 0.
 

@@ -20,7 +20,7 @@ class EpisodeIndex:
 
     Attributes:
         slots: T, the length of the ring, as far as it is filled.
-        streams: N, rows in each slot; row ``slot * N + stream`` is that of a stream in a slot.
+        streams: N, rows in each slot; the row of a stream in a slot is ``slot * N + stream``.
         oldest: slot of the oldest rows.
         begins: [R] int64, positions at which runs begin, ascending.
         places: [R] int64, the places of the rows at ``begins``.

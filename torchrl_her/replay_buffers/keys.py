@@ -115,8 +115,8 @@ def failures(
         achieved_reward: the reward of an achieved goal.
 
     Returns:
-        ``(failed, cost)``, [n, 1] each: bool, and the reward minus that of the reward function, which is
-        below 0, or 0 where nothing failed.
+        ``(failed, cost)``, [n, 1] each: bool, and the reward minus the reward function's result, which
+        is below 0, or 0 where nothing failed.
 
     Example:
         >>> import torch

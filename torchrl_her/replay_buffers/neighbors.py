@@ -30,7 +30,7 @@ MASK = ("collector", "mask")  # TorchRL's mark of what is not padding
 
 
 def samplers_of(storage: Storage) -> Iterator[Sampler]:
-    """Returns the samplers of all buffers that read a storage, those of ensembles one by one."""
+    """Yields the samplers of all buffers that read a storage; for an ensemble, the samplers inside it."""
     waiting: list[Any] = [getattr(buffer, "sampler", None) for buffer in buffers_of(storage)]
     while waiting:
         sampler = waiting.pop()
@@ -97,7 +97,7 @@ def refuse_padded(name: str, transitions: TensorDictBase) -> None:
 
 
 def refuse_stages(name: str, transitions: TensorDictBase, options: HindsightOptions) -> None:
-    """Raises a ValueError if transitions carry a stage although one reward relabels those of all stages."""
+    """Raises a ValueError if transitions carry a stage although one reward relabels all stages."""
     if options.k > 0 and options.stage_key in transitions.keys(True):
         raise ValueError(
             f"{name} got transitions that carry their stage ({options.stage_key!r}), and has one reward for "

@@ -71,9 +71,9 @@ class HindsightOptions:
         trajectory_key: ids that tell trajectories apart; the entry may be missing.
         env_ids_key: ids that tell environments apart, as :class:`~torchrl_her.EnvIds` gives them; the entry
             may be missing, and is not stored by the writer.
-        real_goal_key: the goal that the task itself asked for, where another one was proposed in its place
+        real_goal_key: the task's own goal, if another goal was proposed in its place
             (:class:`~torchrl_her.behavior.BehaviorGoals`); the entry may be missing, and is left out like
-            those of ``exclude``. The source ``"actual"`` takes these goals.
+            entries of ``exclude``. The source ``"actual"`` takes these goals.
         stage_key: key of the stage [..., 1] that an episode was played in, for writers with ``stages``.
         virtual_key: key of a bool [..., 1] that marks virtual transitions; None for no mark.
 
@@ -279,7 +279,7 @@ class HindsightBase:
         self._exclude = in_root_and_next([*options.exclude, options.real_goal_key])
 
     def _compare_rewards(self, rows: TensorDictBase) -> None:
-        """Warns if the rewards of the first rows [n] ever written are not those of the reward function."""
+        """Warns if rewards of the first rows [n] ever written differ from the reward function's."""
         if self._compared or self.k == 0:
             return
         self._compared = True

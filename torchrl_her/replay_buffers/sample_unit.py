@@ -9,8 +9,8 @@ Why this is a ``SampleUnit``, and none of TorchRL's other hooks: a sampler that 
 cannot know which transitions it gets, as their index is added after all transforms. A subclass that relabels
 what ``_sample`` returns comes too late for transforms that use the goal. A ``SampleUnit`` gets the index and
 the storage between drawing and reading, under the buffer's lock, and changes neither. The goals that it chose
-are put in by the collate function, which runs before all transforms. So sampler, index and priorities are
-those of the real transitions, and the storage (``buffer.storage[:]``) has real ones alone.
+are put in by the collate function, which runs before all transforms. So sampler, index and priorities
+belong to the real transitions, and the storage (``buffer.storage[:]``) has no others.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ class _Chosen(NamedTuple):
     shape: torch.Size  # shape of the batch
     rows: Tensor  # [V], places in the flat batch
     goals: Tensor  # [V, g]
-    ends: Tensor | None  # [B, 1], where a sampler of slices ends them
+    ends: Tensor | None  # [B, 1] of bool, where a sampler of slices ends a slice
     ahead: _Ahead | None
 
 
@@ -109,7 +109,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
     transition, whatever goal it had when the priority was computed.
 
     With several ``goal_sources``, each gives its part of the virtual transitions. Goals of recent episodes
-    are read from the newest stored transitions, those of open episodes included.
+    are read from the newest stored transitions, open episodes included.
 
     After each write, sampling the next batch searches the whole storage for the ends of episodes.
 
@@ -348,9 +348,9 @@ class HERSampleUnit(HindsightBase, SampleUnit):
     ) -> tuple[Tensor, Tensor, Tensor | None]:
         """Draws which places [V] in a batch of rows [B] become virtual, and their goals [V, g].
 
-        With metadata, also the rows [B] of their own episodes that achieved these goals; -1 for none.
+        With metadata, also returns for each place [B] the row of its episode that achieved the goal, or -1.
 
-        ``groups``, [G, L], are the places in the batch that share a goal: single ones, or those of a slice.
+        ``groups``, [G, L], are the places in the batch that share a goal: one place, or a slice.
         """
         coin = torch.rand(len(groups), device=row.device, generator=generator)
         becomes = coin < self.k / (self.k + 1)
@@ -558,7 +558,7 @@ def _oldest(storage: Storage) -> int:
     """Returns the slot of a storage's oldest rows.
 
     Reads the writer's cursor, since TorchRL does not restore the cursor of the storage. If several buffers
-    share a storage, the cursor is that of the buffer that has written most.
+    share a storage, the cursor of the buffer that has written most is used.
     """
     if not is_full(storage):
         return 0

@@ -12,8 +12,8 @@ def slice_positions(
     """Groups the transitions of a batch by slice.
 
     Args:
-        place: [B] int64, places in :class:`~torchrl_her.replay_buffers.EpisodeIndex`: those of a slice follow
-            each other.
+        place: [B] int64, places in :class:`~torchrl_her.replay_buffers.EpisodeIndex`; the places of a slice
+            follow each other.
         episode: [B] int64, a number that differs between episodes.
         ends: [B, 1] of bool, the last transitions of slices. Without them, slices that happen to follow each
             other are one.

@@ -202,7 +202,7 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
         self._recent = [RecentGoals.none(runs) for _ in range(max(1, len(self.stages)))]  # by stage
         self._episodes = 0  # copies of episodes ever written, if whole ones are
         self._process = os.getpid()
-        # Whether held-back rows come from a loaded state, or their episodes are over, without a write since.
+        # Whether, since the last write, held-back rows were loaded, or their episodes were ended.
         self._loaded = self._all_over = self._overfull = False
 
     @property
@@ -278,8 +278,8 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
 
         Raises:
             ValueError: the writer cannot work beside another part of the buffer or collector; trajectories
-                were split and padded; environments cannot be told apart; goals or rewards, those of the
-                reward function too, are not finite or do not fit. Nothing of the batch is written then.
+                were split and padded; environments cannot be told apart; goals or rewards (or results of
+                the reward function) are not finite or do not fit. Nothing of the batch is written then.
             KeyError: an entry is missing.
             RuntimeError: the buffer was made by another process.
         """
@@ -360,13 +360,13 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
         continue them.
         """
         if len(state_dict["cursors"]) != self.runs:
-            raise ValueError(f"the state is that of {len(state_dict['cursors'])} runs, not of {self.runs}")
+            raise ValueError(f"the state is of {len(state_dict['cursors'])} runs, not of {self.runs}")
         super().load_state_dict(state_dict)
         self._rings.cursors, self._rings.sizes = list(state_dict["cursors"]), list(state_dict["sizes"])
         self._held = Batch.from_state(state_dict, runs=self.runs)
         recent = state_dict["recent"]
         if len(recent) != max(1, len(self.stages)):
-            raise ValueError(f"the state is that of {len(recent)} stages, not of {max(1, len(self.stages))}")
+            raise ValueError(f"the state is of {len(recent)} stages, not of {max(1, len(self.stages))}")
         self._recent = [RecentGoals.from_state(saved) for saved in recent]
         self._episodes, self._all_over = state_dict["episodes"], state_dict["all_over"]
         self._loaded = True

@@ -295,10 +295,10 @@ def load_buffer_state_dict(buffer: TensorDictReplayBuffer, state: dict[str, Any]
     if any(sizes_of(buffer)):
         raise ValueError(f"the buffer must be empty, it holds {sum(sizes_of(buffer)):,} rows")
     if capacity != state["capacity"]:
-        raise ValueError(f"the state is that of a buffer of {state['capacity']:,} rows, not of {capacity:,}")
+        raise ValueError(f"the state is of a buffer of {state['capacity']:,} rows, not of {capacity:,}")
     load_sampler_state_dict(buffer.sampler, state["sampler"])
     if len(state["blocks"]) != runs_of(buffer):
-        raise ValueError(f"the state is that of {len(state['blocks'])} runs, not of {runs_of(buffer)}")
+        raise ValueError(f"the state is of {len(state['blocks'])} runs, not of {runs_of(buffer)}")
     for (begin, end), block in zip(state["blocks"], state["rows"], strict=True):
         if block is not None:
             _load_block(buffer.storage, begin, end, block)

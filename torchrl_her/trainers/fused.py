@@ -52,8 +52,8 @@ class FusedLearner:
             AVX512-BF16, and takes longer on others. It needs weights in float32. Sums, weights and Adam's
             moments stay float32, and so do the products of the first and the last layer. The action, which
             a critic takes in at its second layer, is rounded there. Numbers in bfloat16 have three
-            significant digits (Kalamkar et al., 2019), so results are those of TorchRL's losses to about a
-            hundredth.
+            significant digits (Kalamkar et al., 2019), so results agree with TorchRL's losses to about
+            a hundredth.
 
     The learner keeps references to the weights: make it after moving the loss to its device and type.
     Entries of the rows are cast to that type, so rewards may be float64 beside networks in float32. Rows may
@@ -114,7 +114,7 @@ class FusedLearner:
         """Makes gradient steps for each run; see :class:`~torchrl_her.trainers.Learner`.
 
         Raises:
-            ValueError: the rows are not those of R runs, not a whole number of batches, not on the CPU, carry
+            ValueError: the rows are not of R runs, not a whole number of batches, not on the CPU, carry
                 a mask of TorchRL's losses or do not fit the networks; a batch of one row is to be
                 normalized; or the loss or its optimizer were changed to what this learner cannot do.
         """

@@ -81,7 +81,7 @@ class GraphLearner(LossLearner):
         """Gradient steps of each run; see :class:`~torchrl_her.trainers.Learner`.
 
         Raises:
-            ValueError: the rows are not those of R runs or not a whole number of batches.
+            ValueError: the rows are not of R runs or not a whole number of batches.
             RuntimeError: the steps could not be recorded, for example because the loss reads a number from
                 the GPU.
         """

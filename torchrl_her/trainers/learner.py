@@ -115,7 +115,7 @@ class LossLearner:
         """Makes gradient steps for each run; see :class:`~torchrl_her.trainers.Learner`.
 
         Raises:
-            ValueError: the rows are not those of R runs or not a whole number of batches, or the loss does
+            ValueError: the rows are not of R runs or not a whole number of batches, or the loss does
                 not give one number for each of them.
         """
         check_rows(rows, steps, self.runs)

@@ -48,11 +48,11 @@ def load_sampler_state_dict(sampler: Sampler, state: dict[str, Any]) -> None:
     """Restores the state that :func:`sampler_state_dict` returned.
 
     Raises:
-        ValueError: the state is that of another kind of sampler.
+        ValueError: the state is of another kind of sampler.
     """
     kind = type(sampler).__name__
     if state["kind"] != kind:
-        raise ValueError(f"the state is that of a {state['kind']}, not of a {kind}")
+        raise ValueError(f"the state is of a {state['kind']}, not of a {kind}")
     if isinstance(sampler, SamplerEnsemble):
         for i, part in enumerate(samplers_in(sampler)):
             load_sampler_state_dict(part, state["own"][str(i)])

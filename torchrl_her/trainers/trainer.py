@@ -86,7 +86,7 @@ class Trainer:
     """Trains in epochs of a fixed number of frames, each beginning with fresh episodes.
 
     Episodes that are still open when an epoch ends are truncated there: their transitions are stored and
-    learned from like those of any other episode.
+    learned from like all others.
 
     If ``on_batch`` raises an exception in the middle of an epoch, the next call of :meth:`epoch` finishes
     that epoch.

@@ -59,7 +59,7 @@ def play(
     RUN is the folder of a run, or the file of a policy in it, FILE a .safetensors that `torchrl-her export`
     wrote, TASK one of the trained policies.
 
-    Keys in the window: space pauses, n or the right arrow takes one step, r goes on to the next goals, + and
+    Keys in the window: space pauses, n or the right arrow takes one step, r skips to the next goals, + and
     - change the speed, q or escape quits.
     """
     sources = (source, *others)

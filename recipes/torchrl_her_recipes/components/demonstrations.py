@@ -56,7 +56,7 @@ class RunDemonstrations:
             write_demonstrations(buffer, self.shown(run), run=run)
 
     def enter_stage(self, run: int) -> None:
-        """Replaces a run's demonstrations by those of the stage that it has entered."""
+        """Replaces a run's demonstrations by the demonstrations of the stage that it has entered."""
         assert self.state is not None
         if self.buffer is not None:
             enter_stage(self.buffer, self.state.progress.stage_of(run), run=run)

@@ -102,7 +102,9 @@ class CollectionConfig(Group):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.ray is not None and self.processes == 0:
-            raise ValueError(f"ray={self.ray} needs to know how many processes collect there: processes=4")
+            raise ValueError(
+                f"ray={self.ray} needs the number of processes that collect there, as in processes=4"
+            )
         if AUTO in (self.num_envs, self.epoch_frames):
             return
         if self.processes and self.num_envs % self.processes:

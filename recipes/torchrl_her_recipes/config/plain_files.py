@@ -67,7 +67,7 @@ def read_text(path: Path, *, largest: int = _LARGEST) -> str:
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise ValueError(f"{path} cannot be read: it is no text in UTF-8") from error
+        raise ValueError(f"{path} cannot be read: it is not UTF-8 text") from error
 
 
 class _Loader(yaml.SafeLoader):
@@ -156,7 +156,7 @@ def read_table(path: Path, *, counts: Sequence[str] = ()) -> list[dict[str, floa
             for row in csv.DictReader(text.splitlines(), strict=True)
         ]
     except (AttributeError, TypeError, ValueError, csv.Error) as error:  # cut short, or not numbers
-        raise ValueError(f"{path} is damaged: a line is no row of the table") from error
+        raise ValueError(f"{path} is damaged: a line is not a row of the table") from error
     for name in counts:
         if odd := [row.get(name) for row in rows if not isinstance(row.get(name), int)]:
             raise ValueError(f"{path} is damaged: {name} must be a whole number, got {shown(odd[0])}")

@@ -251,7 +251,7 @@ def load_study(
 
 
 def _set_in(options: Mapping[str, Any], names: Iterable[str]) -> list[str]:
-    """Returns those of the named options that ``options`` sets, by their names without the group."""
+    """Returns the named options that ``options`` sets, by their names without the group."""
     places = {locate(name) for name in names}
     return [name for group, values in place(options).items() for name in values if (group, name) in places]
 

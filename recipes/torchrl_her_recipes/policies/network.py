@@ -62,7 +62,7 @@ def load_network(
 
 
 def check_weights(builder: LearnerBuilder, weights: Mapping[str, Tensor]) -> None:
-    """Refuses weights that are not those of a builder's actor.
+    """Refuses weights that do not fit a builder's actor.
 
     Shapes come from a file, so they are compared before memory is taken for them.
     """

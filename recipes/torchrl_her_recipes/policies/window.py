@@ -29,7 +29,7 @@ def play(
 ) -> list[Seen]:
     """Shows policies on the same starts and goals: in a video, or in a window until the user closes it.
 
-    Keys in the window: space pauses, n or the right arrow takes one step, r goes on to the next goals, plus
+    Keys in the window: space pauses, n or the right arrow takes one step, r skips to the next goals, plus
     and minus change the speed, q or escape quits.
 
     Args:

@@ -27,7 +27,7 @@ def play_greedily(components: Components, env: EnvBase, epoch: int) -> TensorDic
 def stage_success(
     components: Components, state: CurriculumState, rollout: TensorDictBase, epoch: int
 ) -> Tensor:
-    """Returns success [R, n] at the goals of the runs' stages; in the last stage that of ``rollout``."""
+    """Returns success [R, n] at the goals of the runs' stages; in the last stage, of ``rollout``."""
     runs, last = components.recipe.run.num_runs, len(state.curriculum) - 1
     full = success(rollout, **judging(components.eval_env)).float().view(runs, -1)
     below = state.progress.stage < last

@@ -180,5 +180,5 @@ def _differ(runs: Sequence[Sequence[Row]]) -> bool:
 
 
 def _means(values: Sequence[float]) -> list[float]:
-    """Computes the moving average of values, over as many epochs as a problem must last."""
+    """Computes the moving average of values, over the number of epochs that a problem must last."""
     return [sum(values[end - _STREAK : end]) / _STREAK for end in range(_STREAK, len(values) + 1)]

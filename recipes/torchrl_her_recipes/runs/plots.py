@@ -58,7 +58,7 @@ def plot_curves(rows: Rows, path: Path, *, title: str = "") -> None:
             axes.set_ylim(*limits)
     several = len({row["run"] for row in rows}) > 1
     legend = ["line: median, band: 33rd to 67th percentile, thin lines: single runs"] if several else []
-    legend += ["dotted: a run goes on to the next stage"] if stage_changes(rows) else []
+    legend += ["dotted: a run enters the next stage"] if stage_changes(rows) else []
     figure.supxlabel("; ".join(legend), fontsize=9)
     save_figure(figure, path)
 

@@ -151,7 +151,7 @@ def resume(
     A finished run can be given more epochs only if its recipe has ``keep_buffer=True``. Otherwise its last
     checkpoint has no replay buffer, and only its pictures and its policy are made again.
 
-    With the tasks of this library the result is bit for bit that of a run that never stopped. Environments of
+    With this library's tasks, the run ends bit for bit like a run that never stopped. Environments of
     gymnasium and your own are seeded anew in each epoch, so for them this holds if the run stopped between
     two epochs. After a stop within an epoch, the rest of that epoch consists of new episodes. Such an
     environment must draw only from the generator that it seeds, and keep no state from earlier episodes.

@@ -53,7 +53,7 @@ def test_a_table_that_lost_its_end_holds_up_nobody(left: str, job: Job) -> None:
     (job.folder / "metrics.csv").write_text(left)
     assert read_progress(job.folder).epochs == 0
     if "7" in left:
-        with pytest.raises(ValueError, match=r"metrics\.csv is damaged: a line is no row of the table"):
+        with pytest.raises(ValueError, match=r"metrics\.csv is damaged: a line is not a row of the table"):
             RunFolder(job.folder).rows()
 
 

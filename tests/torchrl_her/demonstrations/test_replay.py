@@ -198,7 +198,7 @@ def test_what_is_no_whole_number_of_batches_is_refused() -> None:
 
 
 def test_buffers_of_other_numbers_of_runs_are_refused() -> None:
-    with pytest.raises(ValueError, match="buffers must have equally many runs, got 2 and 1"):
+    with pytest.raises(ValueError, match="buffers must have the same number of runs, got 2 and 1"):
         MixedReplay(make_buffer(range(2), 10), make_buffer(range(1), 10), batch_size=B)
 
 

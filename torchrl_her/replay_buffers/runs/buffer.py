@@ -11,7 +11,7 @@ from torchrl_her.torchrl_private import count_a_write
 
 
 def runs_of(buffer: ReplayBuffer) -> int:
-    """Returns the number of runs of a buffer: that of its writer, or 1."""
+    """Returns the number of runs of a buffer's writer; 1 if the writer has no runs."""
     return getattr(buffer.writer, "runs", 1)
 
 

@@ -19,7 +19,7 @@ class Chunk:
     """Episodes that are relabeled and written together.
 
     Attributes:
-        rows: [n], collected transitions, those of other episodes among them.
+        rows: [n], collected transitions; other episodes are among them.
         run: [n] int64, the run of each row; None if there is only one.
         piece: Positions of the episodes in ``rows``, by run.
         reward_fn: Maps (achieved, desired) goals to (reward, terminated).

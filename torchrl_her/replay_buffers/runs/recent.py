@@ -117,7 +117,7 @@ def _last(before: Tensor | None, new: Tensor, size: int) -> Tensor | None:
     if len(new) == 0:
         return before
     if len(new) > size:
-        # New goals are ordered by environment, so the last of them would be those of few environments.
+        # New goals are ordered by environment, so the last ones would be from few environments only.
         return new[spread_evenly(len(new), size, new.device)]
     if before is None:
         return new.clone()  # not a view of the whole batch

@@ -19,7 +19,7 @@ from torchrl_her.torchrl_private import generator_of
 
 
 class RunsSampler(StateFile, Sampler):
-    """Draws the same number of transitions of each of R runs; those of a run are equally likely.
+    """Draws the same number of transitions of each of R runs, uniformly within each run.
 
     The storage is R equal blocks of rows, as :class:`~torchrl_her.HERWriter` fills them. A batch is R equal
     blocks, too, in the order of the runs. What a run draws does not depend on the other runs. In place of a
@@ -353,4 +353,4 @@ def _all_finite(priority: Tensor, value: Tensor) -> bool:
 
 def _check_runs(sizes: Tensor, runs: int) -> None:
     if len(sizes) != runs:
-        raise ValueError(f"the state is that of {len(sizes)} runs, not of {runs}")
+        raise ValueError(f"the state is of {len(sizes)} runs, not of {runs}")

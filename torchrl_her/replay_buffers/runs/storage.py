@@ -66,7 +66,7 @@ class PackedStorage(LazyTensorStorage):
         self._packed: Tensor | None = None  # [max_size, bytes / 8] of int64
         self._views: TensorDictBase | None = None  # the same memory, entry by entry
         self._fields: tuple[Field, ...] = ()
-        self._number = 0  # number of keys of the views, those of nested tensordicts included
+        self._number = 0  # number of keys of the views, nested keys included
 
     @property
     def packed(self) -> Tensor | None:
@@ -238,7 +238,7 @@ def _is_plain_node(entry: Any, shape: torch.Size) -> bool:
 
 
 def _number_of_keys(rows: TensorDictBase) -> int:
-    """Counts keys, those of nested tensordicts included."""
+    """Counts keys, nested keys included."""
     return len(list(rows.keys(True, is_leaf=is_leaf_nontensor)))
 
 

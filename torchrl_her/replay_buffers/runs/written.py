@@ -1,4 +1,4 @@
-"""The transitions that a writer stores, made of those that were collected: real ones and virtual ones."""
+"""Real and virtual transitions that a writer stores, made of collected transitions."""
 
 from __future__ import annotations
 
@@ -65,8 +65,8 @@ def real_rows(chunk: Chunk, *, first_id: int) -> WrittenRows:
 
     Args:
         chunk: Episodes of m runs.
-        first_id: Trajectory id of the first episode, if whole ones are written; that of the next one is
-            higher by 1.
+        first_id: Trajectory id of the first episode, if whole episodes are written; ids rise by 1
+            from episode to episode.
     """
     rows, episodes, keys, options = chunk.rows, chunk.episodes, chunk.keys, chunk.options
     root, counts = episodes.rows[episodes.inside], chunk.piece.sums(episodes.lengths)

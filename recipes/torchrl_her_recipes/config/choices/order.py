@@ -43,7 +43,7 @@ class Threshold(Order):
 @dataclass(frozen=True, kw_only=True)
 class _ByEpisode(Order):
     every_stage: bool = option(
-        False, "whether a transition is stored for every stage, not for that of its episode alone"
+        False, "whether a transition is stored for every stage, not only for its episode's stage"
     )
 
 

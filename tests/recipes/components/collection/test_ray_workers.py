@@ -103,5 +103,5 @@ def test_too_few_cores_or_an_environment_that_fails_are_one_line(cluster: Cluste
 
 
 def test_a_cluster_needs_a_number_of_processes() -> None:
-    with pytest.raises(ValueError, match="ray=auto needs to know how many processes collect there"):
+    with pytest.raises(ValueError, match="ray=auto needs the number of processes that collect there"):
         CollectionConfig(ray="auto")

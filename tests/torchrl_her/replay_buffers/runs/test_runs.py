@@ -343,7 +343,7 @@ def test_a_state_goes_on_as_the_unbroken_buffer(sampler: str, packed: bool) -> N
     assert other.writer.totals == buffer.writer.totals
     with pytest.raises(ValueError, match="the buffer must be empty"):
         load_buffer_state_dict(other, state)
-    with pytest.raises(ValueError, match="the state is that of"):
+    with pytest.raises(ValueError, match="the state is of"):
         load_buffer_state_dict(make_buffer(range(2), capacity=60, sampler=sampler, packed=packed), state)
 
 

@@ -184,7 +184,7 @@ def test_a_state_brings_the_same_draws_back(kind: str, to_file: bool, tmp_path: 
     again, info_again = other.sample(storage(), 3 * 16)
     assert torch.equal(index, again)
     assert all(torch.equal(info[key], info_again[key]) for key in info)
-    with pytest.raises(ValueError, match="the state is that of 3 runs, not of 2"):
+    with pytest.raises(ValueError, match="the state is of 3 runs, not of 2"):
         make(kind, 2).load_state_dict(sampler.state_dict())
 
 
