@@ -14,9 +14,9 @@ from PIL import Image
 from torchrl_her_envs import Chain
 from torchrl_her_recipes import Recipe, make_recipe
 
-from .test_teaching import script
+from .pages import script
 
-chain_times = script("make_chain_times")
+chain_times = script("docs/make_chain_times.py")
 episodes_to_solve, plot_times = chain_times.episodes_to_solve, chain_times.plot_times
 ideal_episodes, learning_steps = chain_times.ideal_episodes, chain_times.learning_steps
 

@@ -7,15 +7,14 @@ import importlib.util
 import re
 from pathlib import Path
 from types import ModuleType
-from typing import Any
 
 import pytest
 
 import torchrl_her_recipes
 
 from ..recipes.studies.here import Here
+from .pages import DOCS, blocks, run_page, script
 
-DOCS = Path(__file__).parents[2] / "docs"
 PACKAGES = ("torchrl_her", "torchrl_her_envs", "torchrl_her_recipes")
 LIBRARY = (
     "goals",
@@ -31,18 +30,9 @@ LIBRARY = (
 PAGES = sorted(str(path.relative_to(DOCS)) for path in DOCS.glob("**/*.md"))
 
 
-def blocks(page: str) -> list[str]:
-    return re.findall(r"```python\n(.*?)```", (DOCS / page).read_text(), re.DOTALL)
-
-
 @pytest.fixture(scope="module")
 def conf() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("docs_conf", DOCS / "conf.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return script("docs/conf.py")
 
 
 # The other guides have tests of their own: below, test_examples.py, test_extending.py, test_gym_guide.py.
@@ -67,19 +57,15 @@ def test_a_page_s_python_runs_from_top_to_bottom(
     page: str, number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert len(blocks(page)) == number
-    names: dict[str, object] = {"__name__": page}
-    for block in blocks(page):
-        exec(compile(block, page, "exec"), names)
+    run_page(page, number)
 
 
 def test_hindsight_is_configured_by_hydra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("hydra")
     monkeypatch.chdir(tmp_path)
-    (config,) = re.findall(r"```yaml\n(.*?)```", (DOCS / "hydra.md").read_text(), re.DOTALL)
+    (config,) = blocks("hydra.md", "yaml")
     Path("hindsight.yaml").write_text(config)
-    (block,) = blocks("hydra.md")
-    exec(compile(block, "hydra.md", "exec"), {"__name__": "hydra.md"})
+    run_page("hydra.md", 1)
 
 
 def test_a_policy_is_exported_loaded_and_played_by_onnxruntime(
@@ -88,10 +74,7 @@ def test_a_policy_is_exported_loaded_and_played_by_onnxruntime(
     for name in ("onnx", "onnxruntime", "onnxscript"):
         pytest.importorskip(name, reason="needs the extra onnx")
     monkeypatch.chdir(tmp_path)
-    names: dict[str, object] = {"__name__": "export.md"}
-    assert len(blocks("export.md")) == 3
-    for block in blocks("export.md"):
-        exec(compile(block, "export.md", "exec"), names)
+    run_page("export.md", 3)
     assert Path("hand_v1.md").exists()
 
 
@@ -99,27 +82,15 @@ def test_options_are_searched_for_as_the_guide_says(tmp_path: Path, monkeypatch:
     pytest.importorskip("optuna", reason="needs the extra tune")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(torchrl_her_recipes, "make_workers", lambda **_options: Here())
-    names: dict[str, Any] = {"__name__": "tuning.md"}
-    assert len(blocks("tuning.md")) == 3
-    for block in blocks("tuning.md"):
-        exec(compile(block, "tuning.md", "exec"), names)
+    names = run_page("tuning.md", 3)
     assert Path("runs/tune/best.yaml").exists()
     assert names["best"] in names["scores"]
     assert len(names["study"].trials) == 2
 
 
 def test_the_own_script_trains_and_measures_what_it_has_learned() -> None:
-    text = "\n".join(blocks("own_script.md"))
-    assert len(blocks("own_script.md")) == 4
-    for long, short in (
-        ("seed, total_frames = 0, 200_000", "seed, total_frames = 0, 800"),
-        ("% 20_000", "% 800"),
-    ):
-        assert text.count(long) == 1
-        text = text.replace(long, short)
-    names: dict[str, Any] = {"__name__": "own_script.md"}
-    exec(compile(text, "own_script.md", "exec"), names)
-    ((frames, success),) = names["curve"]
+    shorter = {"total_frames = 0, 200_000": "total_frames = 0, 800", "% 20_000": "% 800"}
+    ((frames, success),) = run_page("own_script.md", 4, shorter=shorter)["curve"]
     assert frames == 800
     assert 0.0 <= success <= 1.0
 

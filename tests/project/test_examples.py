@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import importlib.util
 import re
-import sys
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from types import ModuleType
 
 import pytest
@@ -21,28 +18,20 @@ from torchrl.envs import SerialEnv, TransformedEnv
 from torchrl_her import Curriculum, CurriculumProgress, CurriculumStage, StateToObs, ZeroPad, make_actor
 from torchrl_her.replay_buffers import rows_of_run, sizes_of
 
-DOCS = Path(__file__).parents[2] / "docs"
+from .pages import DOCS, ROOT, blocks, run_page, script
+
 GUIDE = (DOCS / "curriculum.md").read_text()
-
-
-def load(path: Path) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    assert spec is not None
-    assert spec.loader is not None
-    sys.modules[path.stem] = module = importlib.util.module_from_spec(spec)  # dataclasses look there
-    spec.loader.exec_module(module)
-    return module
 
 
 @pytest.fixture(scope="module")
 def example() -> ModuleType:
-    return load(DOCS / "examples" / "own_curriculum.py")
+    return script("docs/examples/own_curriculum.py")
 
 
 def test_the_one_file_moves_from_reaching_to_throwing() -> None:
-    path = DOCS.parent / "recipes" / "one_file_cher.py"
-    assert len(path.read_text().splitlines()) <= 250
-    cher = load(path)
+    path = "recipes/one_file_cher.py"
+    assert len((ROOT / path).read_text().splitlines()) <= 250
+    cher = script(path)
     results = list(cher.train(cher.Options(epochs=4, episodes=20)))
     assert [result.frames for result in results] == [10_240, 20_480, 30_720, 40_960]
     assert (results[0].stage, results[-1].stage) == ("reach", "throw")
@@ -50,16 +39,12 @@ def test_the_one_file_moves_from_reaching_to_throwing() -> None:
 
 
 def test_the_guide_s_python_runs_from_top_to_bottom() -> None:
-    blocks = re.findall(r"```python\n(.*?)```", GUIDE, re.DOTALL)
-    assert len(blocks) == 7
-    names: dict[str, object] = {}
-    for block in blocks:
-        exec(compile(block, "curriculum.md", "exec"), names)
+    run_page("curriculum.md", 7)
 
 
 def test_the_guide_s_stages_are_the_example_s(example: ModuleType) -> None:
     names: dict[str, object] = {}
-    exec(re.findall(r"```python\n(.*?)```", GUIDE, re.DOTALL)[0], names)
+    exec(blocks("curriculum.md")[0], names)
     assert (names["drive"], names["deliver"]) == (example.DRIVE, example.DELIVER)
     assert names["names"] == example.NAMES
 

@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-import re
-from pathlib import Path
-
 import pytest
 
 from torchrl_her_envs import TASKS, gym_id
 
-GUIDE = (Path(__file__).parents[2] / "docs" / "gymnasium.md").read_text()
+from .pages import DOCS, run_page
+
+GUIDE = (DOCS / "gymnasium.md").read_text()
 
 
 def test_the_guide_s_python_runs_from_top_to_bottom() -> None:
     pytest.importorskip("stable_baselines3")
-    blocks = re.findall(r"```python\n(.*?)```", GUIDE, re.DOTALL)
-    assert len(blocks) == 4
-    names: dict[str, object] = {}
-    for block in blocks:
-        exec(compile(block, "gymnasium.md", "exec"), names)
+    run_page("gymnasium.md", 4)
 
 
 def test_the_guide_lists_every_task() -> None:

@@ -15,11 +15,7 @@ from pathlib import Path
 import grimp
 
 ROOT = Path(__file__).parents[2]
-PACKAGES = {
-    "torchrl_her": ROOT,
-    "torchrl_her_envs": ROOT / "envs",
-    "torchrl_her_recipes": ROOT / "recipes",
-}
+PACKAGES = {"torchrl_her": ROOT, "torchrl_her_envs": ROOT / "envs", "torchrl_her_recipes": ROOT / "recipes"}
 CONTRACTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
 
 
@@ -62,13 +58,13 @@ BREACHES = {
         ("torchrl_her.goals.grid", "gymnasium", "torchrl_her.goals.grid -> gymnasium ("),
     ],
     "The environments need neither library nor recipes": [
-        ("torchrl_her_envs.common.seeding", "torchrl_her", "envs.common.seeding -> torchrl_her ("),
+        ("torchrl_her_envs.common.seeding", "torchrl_her", "envs.common.seeding -> torchrl_her (")
     ],
     "Only throwing.physics knows pymunk": [
-        ("torchrl_her_envs.throwing.hand", "pymunk", "torchrl_her_envs.throwing.hand -> pymunk ("),
+        ("torchrl_her_envs.throwing.hand", "pymunk", "torchrl_her_envs.throwing.hand -> pymunk (")
     ],
     "Configurations are read without torch": [
-        ("torchrl_her_recipes.config.versions", "torch", "torchrl_her_recipes.config.versions -> torch ("),
+        ("torchrl_her_recipes.config.versions", "torch", "torchrl_her_recipes.config.versions -> torch (")
     ],
     "Layers of the library": [
         (
@@ -79,28 +75,28 @@ BREACHES = {
         ("torchrl_her.modules.networks", "torchrl_her.goals.grid", "networks -> torchrl_her.goals.grid ("),
     ],
     "Layers of the environments": [
-        ("torchrl_her_envs.common.seeding", "torchrl_her_envs.toy.chain", "-> torchrl_her_envs.toy.chain ("),
+        ("torchrl_her_envs.common.seeding", "torchrl_her_envs.toy.chain", "-> torchrl_her_envs.toy.chain (")
     ],
     "Layers of the throwing tasks": [
         (
             "torchrl_her_envs.throwing.tasks",
             "torchrl_her_envs.throwing.env",
             "tasks -> torchrl_her_envs.throwing.env (",
-        ),
+        )
     ],
     "Layers of the recipes": [
         (
             "torchrl_her_recipes.runs.folder",
             "torchrl_her_recipes.cli",
             "runs.folder -> torchrl_her_recipes.cli (",
-        ),
+        )
     ],
     "No circles": [
         (
             "torchrl_her_envs.toy.base",
             "torchrl_her_envs.toy.chain",
             "No cycles are allowed in torchrl_her_envs.toy.",
-        ),
+        )
     ],
 }
 

@@ -18,17 +18,7 @@ from torchrl_her_recipes.config.shortcuts import locate
 ROOT = Path(__file__).parents[2]
 _ARGUMENT = re.compile(r"(?<![\w.\[])([a-z_]+(?:\.[a-z_]+)*)=([^\s,;()`:]+)")
 # Arguments of functions, in messages that only those who write Python meet.
-_PYTHON = {
-    "at_least",
-    "at_most",
-    "card",
-    "folder",
-    "format",
-    "gpus_per_job",
-    "high",
-    "info_keys",
-    "length",
-}
+_PYTHON = {"at_least", "at_most", "card", "folder", "format", "gpus_per_job", "high", "info_keys", "length"}
 _PYTHON |= {"low", "name", "num_links", "policy", "preset", "render_mode", "run"}
 _BASES = [
     {"task": "hand_v1"},

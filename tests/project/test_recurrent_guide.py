@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
-from pathlib import Path
 from types import ModuleType
 
 import pytest
@@ -12,20 +10,15 @@ from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.modules import set_recurrent_mode
 
+from .pages import script
+
 # The episodes of a batch are of different lengths, and stay so.
 pytestmark = pytest.mark.filterwarnings("ignore:SliceSampler returned a short flat batch:UserWarning")
-
-DOCS = Path(__file__).parents[2] / "docs"
 
 
 @pytest.fixture(scope="module")
 def example() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("recurrent", DOCS / "examples" / "recurrent.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return script("docs/examples/recurrent.py")
 
 
 @pytest.fixture(scope="module")
@@ -63,9 +56,7 @@ def boundaries(rows: TensorDict) -> tuple[list[int], list[int]]:
     return starts, [*starts[1:], len(rows)]
 
 
-def test_goals_are_hidden_after_the_third_step_virtual_ones_too(
-    sampled: tuple[TensorDict, object],
-) -> None:
+def test_goals_are_hidden_after_the_third_step_virtual_ones_too(sampled: tuple[TensorDict, object]) -> None:
     rows, _ = sampled
     for step in (rows, rows["next"]):
         shown = step["step_count"].squeeze(-1) < 3

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import re
 import tomllib
 from importlib import metadata
@@ -14,27 +13,22 @@ import yaml
 
 from torchrl_her.native import library
 
-ROOT = Path(__file__).parents[2]
+from .pages import ROOT, script
+
 VERSION = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
 CITATION = "title: torchrl-her\nversion: 1.2.0\n"
 CHANGELOG = "# Changelog\n\n## 1.2.0 (2026-12-01)\n\n- New: a thing.\n\n## 1.1.0 (2026-11-01)\n\n- Old.\n"
 
 
-def load(path: str) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(Path(path).stem, ROOT / path)
-    spec.loader.exec_module(module := importlib.util.module_from_spec(spec))
-    return module
-
-
 @pytest.fixture
 def release(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     monkeypatch.syspath_prepend(ROOT / ".ci")
-    return load(".ci/release.py")
+    return script(".ci/release.py")
 
 
 @pytest.fixture(scope="module")
 def build() -> ModuleType:
-    return load("hatch_build.py")
+    return script("hatch_build.py")
 
 
 def test_the_version_is_the_same_everywhere(release: ModuleType) -> None:

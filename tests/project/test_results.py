@@ -6,12 +6,12 @@ import re
 
 from torchrl_her_recipes.reports.tidy import is_results, read_results
 
-from .test_teaching import DOCS, script
+from .pages import DOCS, script
 
 
 def test_tables_of_success_are_of_the_numbers_that_are_stored() -> None:
     """Rows with runs, frames and success are as make_results.py prints them; columns may be missing."""
-    results = script("make_results")
+    results = script("docs/make_results.py")
     stored = [
         ({name, cell.task, cell.algorithm}, results.entries(cell))
         for name in results.STUDIES
@@ -34,13 +34,13 @@ def test_tables_of_success_are_of_the_numbers_that_are_stored() -> None:
 
 
 def test_the_scoreboard_is_as_made_again() -> None:
-    scoreboard = script("make_scoreboard")
+    scoreboard = script("docs/make_scoreboard.py")
     text = scoreboard.PAGE.read_text()
     assert scoreboard.page(text) == text, "run: python docs/make_scoreboard.py"
 
 
 def test_steps_to_a_level_are_those_of_each_run() -> None:
-    scoreboard = script("make_scoreboard")
+    scoreboard = script("docs/make_scoreboard.py")
     rows = [
         {"run": run, "frames": 10.0 * step, "success": success}
         for run, successes in enumerate([(0.5, 0.9, 0.8), (0.1, 0.2, 0.3)])

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import importlib.util
 import inspect
 import json
 import re
 import sys
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import pytest
@@ -19,22 +17,13 @@ from torchrl_her_recipes.components.first_look import resolved
 from torchrl_her_recipes.config.policy_header import read_header
 from torchrl_her_recipes.config.shipped import policy_files
 
-DOCS = Path(__file__).parents[2] / "docs"
+from .pages import DOCS, run_page, script
+
 NOTEBOOKS = sorted((DOCS / "notebooks").glob("*.ipynb"))
 
 
-def script(name: str) -> ModuleType:
-    """A script of the documentation, as a module."""
-    spec = importlib.util.spec_from_file_location(f"docs_{name}", DOCS / f"{name}.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 def test_the_page_on_the_command_line_is_what_the_program_says() -> None:
-    made = script("make_command_line").page()
+    made = script("docs/make_command_line.py").page()
     assert (DOCS / "command_line.md").read_text() == made, "run: python docs/make_command_line.py"
     assert "### Options of `hindsight`" in made
     assert max(map(len, made.splitlines())) <= 110
@@ -64,7 +53,7 @@ def test_the_films_are_small_and_move() -> None:
 
 
 def test_a_film_is_made_of_a_policy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    gallery = script("make_gallery")
+    gallery = script("docs/make_gallery.py")
     for name, value in {"GALLERY": tmp_path, "GOALS": 1, "SIZE": 40}.items():
         monkeypatch.setattr(gallery, name, value)
     assert re.fullmatch(r"hand_reach: [01] of 1 goals achieved, \d+ kB", gallery.make_film("hand_reach"))
@@ -88,7 +77,7 @@ def test_the_notebooks_run_and_show_the_figures_that_they_are_committed_with(
     for name in ("JUPYTER_RUNTIME_DIR", "JUPYTER_CONFIG_DIR", "JUPYTER_DATA_DIR", "IPYTHONDIR"):
         monkeypatch.setenv(name, str(tmp_path / name.lower()))
     monkeypatch.delenv("MPLBACKEND", raising=False)  # the kernel's own, as when a user runs it
-    notebooks, short = script("make_notebooks"), tmp_path / "short"
+    notebooks, short = script("docs/make_notebooks.py"), tmp_path / "short"
     short.mkdir()
     assert len(NOTEBOOKS) == 3
     for path in NOTEBOOKS:  # each trains for two epochs
@@ -120,7 +109,7 @@ def test_a_notebook_is_small_and_says_nothing_of_a_machine(path: Path) -> None:
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_a_notebook_is_a_page_whose_links_lead_somewhere(path: Path) -> None:
-    conf = script("conf")
+    conf = script("docs/conf.py")
     text = path.read_text()
     source = "\n".join("".join(cell["source"]) for cell in json.loads(text)["cells"])
     links = re.findall(r"\]\(([^)#:\s]+)(?:#[^)]*)?\)", source)
@@ -143,21 +132,16 @@ def test_both_programs_of_the_page_for_users_of_stable_baselines3_train(
 ) -> None:
     pytest.importorskip("stable_baselines3")
     monkeypatch.chdir(tmp_path)
-    theirs, ours = re.findall(r"```python\n(.*?)```", (DOCS / "from_sb3.md").read_text(), re.DOTALL)
-    for long, short in (
-        ("learn(20_000)", "learn(205)"),
-        ("learning_starts=1_000", "learning_starts=200"),
-        ("n_eval_episodes=100", "n_eval_episodes=2"),
-        ("warmup_frames=1_000", "warmup_frames=640"),
-        ("epoch_frames=5_000", "epoch_frames=640"),
-        ("episodes=100,", "episodes=10,"),
-    ):
-        assert (theirs + ours).count(long) == 1, long
-        theirs, ours = theirs.replace(long, short), ours.replace(long, short)
-    names: dict[str, Any] = {}
-    exec(compile(theirs, "from_sb3.md", "exec"), names)
+    shorter = {
+        "learn(20_000)": "learn(205)",
+        "learning_starts=1_000": "learning_starts=200",
+        "n_eval_episodes=100": "n_eval_episodes=2",
+        "warmup_frames=1_000": "warmup_frames=640",
+        "epoch_frames=5_000": "epoch_frames=640",
+        "episodes=100,": "episodes=10,",
+    }
+    names = run_page("from_sb3.md", 2, shorter=shorter)
     assert -50.0 <= names["mean_return"] <= 0.0
-    exec(compile(ours, "from_sb3.md", "exec"), names)
     assert 0.0 <= names["success"] <= 1.0
 
 

@@ -13,7 +13,7 @@ import pytest
 from torchrl_her_recipes.reports.results import Combination
 from torchrl_her_recipes.reports.tidy import Results
 
-from .test_teaching import DOCS, script
+from .pages import DOCS, script
 
 PAGE = DOCS / "thesis.md"
 TASK = "hand_v0"
@@ -22,7 +22,7 @@ TASK = "hand_v0"
 @pytest.fixture(scope="module")
 def thesis() -> ModuleType:
     pytest.importorskip("arch", reason="needs the extra report")
-    return script("make_thesis")
+    return script("docs/make_thesis.py")
 
 
 def study(runs: Mapping[str, Sequence[float]]) -> Results:

@@ -17,9 +17,9 @@ from torchrl_her_recipes import Study, build, run
 from torchrl_her_recipes.studies.seed_batches import Batches
 
 from ..recipes.small import small
-from .test_teaching import script
+from .pages import script
 
-figures = script("make_toy_values")
+figures = script("docs/make_toy_values.py")
 KEYS = ["observation", "desired_goal"]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,8 @@ from tensordict import TensorDictBase
 from torchrl_her import load_checkpoint
 from torchrl_her_recipes import Components, Recipe, make_recipe
 from torchrl_her_recipes.runs.interrupt import Interrupted
+
+Refused = Callable[..., str]  # the fixture `refused`
 
 SMALL: dict[str, Any] = {
     "epochs": 2,

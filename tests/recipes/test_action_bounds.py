@@ -51,7 +51,6 @@ def test_demonstrations_are_in_the_units_of_the_task_and_learned_from_in_those_o
     assert (shown.rows["action"] > 1.5).any()
     options = {"demonstrations.file": str(file), "demonstrations.episodes": 5}
     components = build(small(task=TASK, epochs=1, **options))
-    assert components.demonstrations is not None
     seen = components.demonstrations.shown(0).rows["action"]
     torch.testing.assert_close(LOW + (seen + 1) / 2 * (HIGH - LOW), shown.rows["action"], atol=1e-4, rtol=0)
     run(components, progress=False)

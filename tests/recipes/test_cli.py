@@ -11,10 +11,10 @@ import pytest
 import yaml
 
 import torchrl_her_recipes
-from torchrl_her_recipes import cli
+from torchrl_her_recipes import ALGORITHMS, cli
 from torchrl_her_recipes.config.shipped import CONF, load_preset
 
-from .small import overrides
+from .small import Refused, overrides
 from .studies.forked_worker import fork_workers
 
 PRESETS = sorted((CONF / "preset").glob("*.yaml"))
@@ -73,8 +73,8 @@ def test_the_end_of_several_runs_hides_none_that_failed(
 def test_list(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["list"]) == 0
     out = capsys.readouterr().out
-    for name in ("hand_wall_v1", "robot_reach", "filtered_her", "demo"):
-        assert name in out
+    for name in ("hand_wall_v1", "robot_reach", "demo", *ALGORITHMS):
+        assert f"  {name} " in out
     assert max(len(line) for line in out.splitlines()) < 110
 
 
@@ -98,20 +98,14 @@ def test_every_preset_runs(preset: Path) -> None:
     ("command", "message"),
     [
         ("train task=hand_v9", "unknown task 'hand_v9'; did you mean hand_v0? The tasks are hand_reach"),
-        ("train algo=sarsa", "unknown algorithm 'sarsa'; the algorithms are no_hindsight, her, filt"),
         ("train speed=3", "no option 'speed'"),
-        ("train seed=1 seed=2", "seed=1 and seed=2 set the same option: give one of them"),
         ("train task=bit_flip task.options.X=3", "bit_flip takes no option 'X'; its options are bits"),
         ("train task=bit_flip 'task.options={1: 2}'", "a mapping of options by name, got {1: 2}"),
-        ("train task=bit_flip threshold=0.1", "threshold=0.1 has no effect with task=bit_flip"),
-        ("train task=bit_flip dtype=float64", "dtype=float64 has no effect with task=bit_flip"),
         ("train task.options.threshold=1 threshold=2", "are the same option: give one of them"),
-        ("train learner=sac algo=cher stage_epsilon=0.5", "has no effect with learner=sac"),
         ("train algo=cher stages=3", "list of stages, each with its options by name, got 3"),
         ("train -m seed=0,0", "the sweep has the same run twice: seed=0; give each value once"),
         ("train -m seed=1,2,01 k=2,3", "same run twice: seed=1 k=2; give each value once"),
         ("train -m algo=her,", "algo needs a value, got 'algo=her,'"),
-        ("train task=3", "task must be text, got 3"),
         ("train task=[hand_v0", "[hand_v0 cannot be read as a value of YAML"),
         (
             "train task_options.continuing_task=false",
@@ -124,16 +118,8 @@ def test_every_preset_runs(preset: Path) -> None:
         ("--import no_such_module list", "there is no module 'no_such_module', neither in this folder"),
         ("--import own.py list", "named as in an import statement, without .py; got 'own.py'"),
         ("trian", "unknown command 'trian'; did you mean train? The commands are check, train, record, play"),
-        ("train lerning_rate=3", "no option 'lerning_rate'; did you mean learning_rate?"),
         ("train hand_v0", "got 'hand_v0'; did you mean task=hand_v0?"),
-        ("train weights.flor=3", "no option 'weights.flor'; did you mean floor?"),
-        ("train ibs.sigma=3", "ibs.sigma is called weights.sigma now"),
-        ("train curriculum.order=all_at_once", "curriculum.order is called order now"),
         ("train seed=1,2", "several are a sweep: torchrl-her train -m"),
-        ("train learner=ddpg critics=5", "learner=ddpg has no option critics"),
-        ("train task=bit_flip action_penalty=50", "action_penalty=50 has no effect with learner=dqn"),
-        ("train algo=no_hindsight k=8", "k=8 has no effect with algo=no_hindsight"),
-        ("train algo=her window=8", "window=8 has no effect with algo=her"),
         ("train -x", "No such option '-x'"),
         ("train --dry", "No such option '--dry'\n"),
         ("train --folde x", "No such option '--folde'. Did you mean '--folder'?"),
@@ -144,9 +130,6 @@ def test_every_preset_runs(preset: Path) -> None:
         ("play hand_v0 --out x.png", "its suffix must be one of .gif, .mp4"),
         ("study biass", "there is no study 'biass'; did you mean bias?"),
         ("train epochs=many", "epochs must be a whole number, got 'many'"),
-        ("train preset=no", "there is no preset 'no'; the presets are demo"),
-        ("train buffer_size=10", "must fit buffer_size=10"),
-        ("train threshold=-1", "threshold must be above 0, got -1.0"),
         ("train folder=/proc/nothing/here", "cannot use /proc/nothing"),
         ("train folder=", "folder needs a value, got 'folder='"),
         ("train buffer_size=99999999999999", "buffer_size=99999999999999 needs 11000000 GB"),
@@ -163,15 +146,8 @@ def test_every_preset_runs(preset: Path) -> None:
         ),
     ],
 )
-def test_bad_input_is_one_line_and_exit_code_2(
-    command: str, message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert cli.main(shlex.split(command)) == 2
-    captured = capsys.readouterr()
-    assert captured.err.startswith("torchrl-her: ")
-    assert message in captured.err
-    assert captured.err.count("\n") == 1
-    assert "Traceback" not in captured.err
+def test_bad_input_is_one_line_and_exit_code_2(command: str, message: str, refused: Refused) -> None:
+    assert message in refused(*shlex.split(command))
     assert not Path("nowhere").exists()
     assert not Path("runs").exists()
 
@@ -183,7 +159,6 @@ def test_no_command_shows_how_to_use_it(capsys: pytest.CaptureFixture[str]) -> N
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
-def test_a_folder_that_may_not_be_written(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_folder_that_may_not_be_written(refused: Refused) -> None:
     Path("locked").mkdir(mode=0o500)
-    assert cli.main(["train", "folder=locked/run"]) == 2
-    assert "cannot use locked/run: permission denied" in capsys.readouterr().err
+    assert "cannot use locked/run: permission denied" in refused("train", "folder=locked/run")

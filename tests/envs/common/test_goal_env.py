@@ -108,9 +108,7 @@ def test_entries_of_throwing_states_are_what_their_names_say(name: str) -> None:
     if env.task.throws:
         assert torch.equal(state[:, names["hole"]], env.worlds.goal.float())
         for stage, parts in zip(
-            env.stages(),
-            ([env.task.effector], [env.task.effector, "ball", "ball_speed"]),
-            strict=True,
+            env.stages(), ([env.task.effector], [env.task.effector, "ball", "ball_speed"]), strict=True
         ):
             assert stage["observation"] == [place for part in parts for place in names[part]]
 

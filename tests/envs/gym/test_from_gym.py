@@ -14,12 +14,10 @@ import pytest
 import torch
 from gymnasium import spaces
 from tensordict import TensorDict
-from torchrl.collectors import Collector
-from torchrl.data import Bounded, Categorical, LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.data import Bounded, Categorical
 from torchrl.envs import ActionScaling, TransformedEnv
-from torchrl.envs.utils import RandomPolicy, check_env_specs
+from torchrl.envs.utils import check_env_specs
 
-from torchrl_her import EnvReward, HERWriter
 from torchrl_her_envs import GymGoalEnv, goal_env, make_gym_env
 from torchrl_her_envs.gym.drawing import choose_renderer
 
@@ -303,20 +301,6 @@ def test_goals_are_not_written_over_whatever_a_function_does() -> None:
     goals = torch.zeros(3, 1, dtype=torch.float64)
     assert env.compute_reward(goals, goals).tolist() == [[0.0]] * 3
     assert goals.tolist() == [[0.0]] * 3
-
-
-def test_virtual_rows_are_judged_by_the_environment() -> None:
-    env = walk(4, form="single")
-    writer = HERWriter(EnvReward(env.compute_reward, env.compute_terminated), k=4)
-    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(5_000), writer=writer, batch_size=8)
-    for batch in Collector(env, RandomPolicy(env.full_action_spec), frames_per_batch=80, total_frames=400):
-        buffer.extend(batch)
-    rows = buffer[:]
-    virtual = rows[rows["virtual"].flatten()]
-    gap = virtual["next", "achieved_goal"] - virtual["next", "desired_goal"]
-    assert len(virtual) > 800
-    assert torch.equal(virtual["next", "reward"], -(gap != 0).float() - (gap > 2).float())
-    assert torch.equal(virtual["next", "terminated"], gap == 0)
 
 
 def test_there_is_at_least_one_environment() -> None:

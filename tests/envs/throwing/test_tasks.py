@@ -118,14 +118,8 @@ def test_numbers_of_steps_may_be_whole_floats() -> None:
 @pytest.mark.parametrize(
     ("substeps", "message"),
     [
-        (
-            1,
-            "a wall needs at least 3 substeps, got 1: a ball of up to 15.7 m/s moves 0.63 m in a substep",
-        ),
-        (
-            2,
-            "3 substeps, got 2: .* 0.315 m in a substep, .* half of the wall's thickness, 0.24 m together",
-        ),
+        (1, "a wall needs at least 3 substeps, got 1: a ball of up to 15.7 m/s moves 0.63 m in a substep"),
+        (2, "3 substeps, got 2: .* 0.315 m in a substep, .* half of the wall's thickness, 0.24 m together"),
     ],
 )
 def test_balls_that_could_pass_through_the_wall_are_refused(

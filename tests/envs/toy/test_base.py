@@ -9,26 +9,12 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule, TensorDictSequential
-from torchrl.collectors import Collector
 from torchrl.envs.utils import check_env_specs
-from torchrl.modules import MLP, EGreedyModule, QValueActor
-from torchrl.objectives import DQNLoss, SoftUpdate
 
 from torchrl_her import GoalReward
 from torchrl_her_envs import BitFlip, Chain, ToyEnv, TreasureHunt
 
-from .toy_envs import (
-    SHOWN,
-    Make,
-    act,
-    collect,
-    every_env,
-    everything,
-    random_actions,
-    relabelled,
-    some_env,
-)
+from .toy_envs import SHOWN, Make, act, collect, every_env, everything, random_actions, some_env
 
 
 @every_env
@@ -49,20 +35,6 @@ def test_entries_do_not_share_memory(make: Make) -> None:
     shown = make(num_envs=2).reset()
     pointers = {shown[key].untyped_storage().data_ptr() for key in SHOWN}
     assert len(pointers) == len(SHOWN)
-
-
-@every_env
-def test_a_collector_gets_whole_episodes(make: Make) -> None:
-    env = make(num_envs=2)
-    most = env.max_steps
-    collector = Collector(env, frames_per_batch=2 * 40, total_frames=2 * 40)
-    (steps,) = list(collector)
-    collector.shutdown()
-    lengths = steps["collector", "traj_ids"].flatten().unique(return_counts=True)[1]
-    assert lengths.max() <= most
-    for world in steps:
-        ids, done = world["collector", "traj_ids"].flatten(), world["next", "done"].flatten()
-        assert torch.equal(ids[1:] != ids[:-1], done[:-1])
 
 
 @settings(max_examples=15, deadline=None)
@@ -86,17 +58,6 @@ def test_seeds_give_equal_blocks_each_as_if_alone(make: Make) -> None:
         assert torch.equal(everything(collect(alone, actions[:, block])), seen[block])
 
 
-@every_env
-def test_set_seed_starts_over(make: Make) -> None:
-    env, fresh = make(num_envs=8, seed=1), make(num_envs=8, seed=5)
-    actions = random_actions(env, 30)
-    first = collect(env, actions)
-    env.set_seed(5)
-    again = everything(collect(env, actions))
-    assert torch.equal(again, everything(collect(fresh, actions)))
-    assert not torch.equal(again, everything(first))
-
-
 def test_environments_seeds_and_episodes_differ() -> None:
     starts = []
     for seed in (0, 1):
@@ -110,13 +71,6 @@ def test_starts_do_not_depend_on_how_long_episodes_are() -> None:
     for _ in range(3):
         assert torch.equal(short.reset()["state"], long.reset()["state"])
         act(short, 0)
-
-
-@every_env
-def test_torchs_generator_is_left_alone(make: Make) -> None:
-    before = torch.get_rng_state()
-    collect(make(num_envs=2), random_actions(make(num_envs=2), 9))
-    assert torch.equal(before, torch.get_rng_state())
 
 
 @settings(max_examples=15, deadline=None)
@@ -191,49 +145,6 @@ def test_rewards_are_broadcast() -> None:
 def test_no_episode_starts_at_its_goal(make: Make) -> None:
     shown = make(num_envs=2000).reset()
     assert (shown["achieved_goal"] != shown["desired_goal"]).any(-1).all()
-
-
-@every_env
-def test_virtual_goals_were_reached_in_the_same_episode(make: Make) -> None:
-    env = make(num_envs=4)
-    steps = collect(env, random_actions(env, 30))
-    number = torch.arange(4).unsqueeze(-1) * 100 + torch.cat(
-        (torch.zeros(4, 1), steps["next", "done"].squeeze(-1)[:, :-1].cumsum(-1)), -1
-    )
-    steps["episode"] = number.unsqueeze(-1)
-    real, virtual = relabelled(env, steps)
-    assert torch.equal(real["next", "reward"].sum(), (real["next", "terminated"].sum() - len(real)).float())
-    assert len(virtual) == 4 * len(real)
-    assert (virtual["next", "reward"] == 0).any()
-    reached: dict[float, list[list[float]]] = {}
-    for episode, goal in zip(real["episode"].flatten(), real["next", "achieved_goal"], strict=True):
-        reached.setdefault(episode.item(), []).append(goal.tolist())
-    for episode, goal in zip(virtual["episode"].flatten(), virtual["desired_goal"], strict=True):
-        assert goal.tolist() in reached[episode.item()]
-    after = virtual["next"]
-    goals = after["achieved_goal"], after["desired_goal"]
-    assert torch.equal(after["reward"], env.compute_reward(*goals))
-    assert torch.equal(after["terminated"], env.compute_terminated(*goals))
-
-
-@every_env
-def test_torchrls_q_learning_takes_the_actions(make: Make) -> None:
-    env = make(num_envs=4)
-    width = env.observation_spec["state"].shape[-1]
-    net = MLP(in_features=width, out_features=env.num_actions, num_cells=[16])
-    actor = QValueActor(
-        TensorDictModule(net, ["observation", "desired_goal"], ["action_value"]),
-        spec=env.action_spec_unbatched,
-    )
-    policy = TensorDictSequential(actor, EGreedyModule(env.action_spec_unbatched, eps_init=0.5))
-    real, virtual = relabelled(env, env.rollout(40, policy, break_when_any_done=False))
-    loss = DQNLoss(actor, action_space=env.action_spec, delay_value=True, double_dqn=True)
-    loss.make_value_estimator(gamma=0.98)
-    SoftUpdate(loss, eps=0.99)
-    value = loss(torch.cat((real, virtual)))["loss"]
-    value.backward()
-    assert value.isfinite()
-    assert all(weight.grad is not None for weight in loss.value_network_params.values(True, True))
 
 
 @pytest.mark.parametrize(

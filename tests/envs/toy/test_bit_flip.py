@@ -9,13 +9,7 @@ import torch
 
 from torchrl_her_envs import BitFlip, ToyEnv
 
-from .toy_envs import (
-    act,
-    collect,
-    put,
-    random_actions,
-    relabelled,
-)
+from .toy_envs import act, collect, put, random_actions, relabelled
 
 
 def test_bits_are_flipped_one_after_the_other() -> None:

@@ -12,10 +12,7 @@ from tensordict import TensorDictBase
 
 from torchrl_her_envs import Chain, ToyEnv
 
-from .toy_envs import (
-    act,
-    put,
-)
+from .toy_envs import act, put
 
 
 def test_transitions_differ_from_start_to_start_step_to_step_and_environment_to_environment() -> None:

@@ -7,10 +7,7 @@ import torch
 
 from torchrl_her_envs import LatticeGoals
 
-from .toy_envs import (
-    Make,
-    every_env,
-)
+from .toy_envs import Make, every_env
 
 
 def test_lattices() -> None:

@@ -12,11 +12,7 @@ import torch
 
 from torchrl_her_envs import ToyEnv, TreasureHunt
 
-from .toy_envs import (
-    act,
-    put,
-    relabelled,
-)
+from .toy_envs import act, put, relabelled
 
 
 def test_the_pirate_walks_to_the_treasure() -> None:

@@ -35,25 +35,6 @@ def test_auto_follows_the_actions(options: dict[str, Any], name: str) -> None:
     assert learner_of(recipe, TaskEnvs.of(recipe).make(1, [0])).name == name
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (
-            {"task": "bit_flip", "learner": "td3"},
-            "not be used on bit_flip, .* discrete actions: choose dqn",
-        ),
-        (
-            {"task": "hand_v0", "learner": "dqn"},
-            "continuous actions: choose ddpg or td3 or sac or redq or tqc or auto",
-        ),
-    ],
-)
-def test_what_does_not_fit_is_refused(options: dict[str, Any], message: str) -> None:
-    recipe = small(**options)
-    with pytest.raises(ValueError, match=message):
-        learner_of(recipe, TaskEnvs.of(recipe).make(1, [0]))
-
-
 def test_an_option_of_ddpg_is_refused_where_auto_turns_out_to_be_dqn() -> None:
     """Where the name of the task does not tell its actions, this is known when the environment is made."""
     recipe = Recipe.from_dict({"task": {"name": "bit_flip"}, "learner": {"action_penalty": 0.5}})
@@ -72,7 +53,6 @@ def test_a_learner_that_explores_by_itself_gets_no_epsilon_when_a_stage_begins(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     components = build(small(task="hand_v1", algo="cher", learner="sac", window=1))
-    assert components.curriculum is not None
     progress = components.curriculum.progress
     record = progress.record
     monkeypatch.setattr(progress, "record", lambda samples: record(torch.ones_like(samples)))

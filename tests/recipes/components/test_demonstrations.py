@@ -42,7 +42,6 @@ def test_each_batch_has_its_share_of_them(file: str) -> None:
     assert isinstance(trainer.buffer, MixedReplay)
     rows = trainer.buffer.sample(32 * 3).view(3, 32)
     assert rows["demonstration"].sum((1, 2)).tolist() == [8, 8, 8]
-    assert components.demonstrations is not None
     recorded = Demonstrations.load(file).first(4)
     assert sizes_of(components.demonstrations.buffer) == [
         components.demonstrations.buffer.writer.counts.real
@@ -77,16 +76,13 @@ def test_compiled_steps_cannot_be_asked_for(file: str) -> None:
 
 def test_they_are_normalized_with_all_other_rows(file: str) -> None:
     components = build(small(**asked(file), normalize=True))
-    assert components.norm is not None
     counted = components.norm.moments_of("observation").n
-    assert components.demonstrations is not None
     assert counted.unique().tolist() == [len(components.demonstrations.buffer)]
     components.trainer().epoch()
 
 
 def test_numbers_of_another_type(file: str) -> None:
     components = build(small(**asked(file), dtype="float64"))
-    assert components.demonstrations is not None
     assert components.demonstrations.buffer.storage[:]["observation"].dtype == torch.float64
     components.trainer().epoch()
 
@@ -95,8 +91,6 @@ def test_another_threshold_rewards_them_anew(file: str) -> None:
     loose, usual = (
         build(small(**asked(file), **options)).demonstrations for options in ({"threshold": 0.6}, {})
     )
-    assert loose is not None
-    assert usual is not None
     assert int(loose.shown(0).lengths.sum()) < int(usual.shown(0).lengths.sum())
     assert loose.shown(0).achieved.all()
 
@@ -107,10 +101,6 @@ def test_another_threshold_rewards_them_anew(file: str) -> None:
 def test_a_run_that_changes_its_stage_sees_them_in_the_new_one(file: str) -> None:
     components = build(small(**asked(file, starts_share=0.5), algo="cher", num_runs=2, normalize=True))
     shown, state = components.demonstrations, components.curriculum
-    assert shown is not None
-    assert shown.buffer is not None
-    assert shown.starts is not None
-    assert state is not None
     before = [rows_of_run(shown.buffer, own).clone() for own in range(2)]
     assert (before[0]["observation"][:, 5:] == 0).all()  # the ball is hidden
     state.progress.set_stage(1, 1)
@@ -135,7 +125,6 @@ def test_a_curriculum_is_trained_with_them(file: str) -> None:
     )
     result = run(components, progress=False)
     assert {row["stage"] for row in result.rows} == {0, 1}
-    assert components.demonstrations is not None
     assert (components.demonstrations.buffer.storage[:]["observation"][:, 5:] != 0).any()
 
 
@@ -145,10 +134,8 @@ def test_a_curriculum_is_trained_with_them(file: str) -> None:
 def test_episodes_start_at_them(file: str) -> None:
     components = build(small(**asked(file, starts_share=1.0, share=0.0)))
     components.collector.next()
-    assert components.demonstrations is not None
     assert components.demonstrations.buffer is None
     starts = components.demonstrations.starts
-    assert starts is not None
     assert sum(len(own) for own in starts.walk.state_dict()["outcomes"]) > 0
     assert starts.walk.state_dict()["longest"] == [int(components.demonstrations.recorded.lengths.max())]
     rollout = components.eval_env.rollout(3)
@@ -178,8 +165,6 @@ def test_each_run_follows_the_single_run_with_its_seed(options: dict[str, Any], 
         alone = build(small(**own, seed=5 + number))
         run(alone, progress=False)
         torch.testing.assert_close(weights(together, number), weights(alone, 0), rtol=1e-4, atol=1e-6)
-        assert together.demonstrations is not None
-        assert alone.demonstrations is not None
         rows, single = (
             rows_of_run(each.buffer, place)
             for each, place in ((together.demonstrations, number), (alone.demonstrations, 0))
@@ -200,10 +185,8 @@ def test_discrete_actions_are_learned_from_without_cloning(tmp_path: Path) -> No
     options = asked(str(tmp_path / "chain.pt"), starts_share=1.0) | {"task": "chain"}
     components = build(small(**options, **{"task.options.length": 6}))
     shown = components.demonstrations
-    assert shown is not None
     components.trainer().run(800)
     assert shown.recorded.achieved.all()
-    assert shown.starts is not None
     assert shown.starts.walk.back == [6]  # all the way
 
 
@@ -225,10 +208,7 @@ def test_rows_are_learned_from_while_other_processes_collect(file: str) -> None:
     ("options", "message"),
     [
         ({"task": "hand_v0"}, r"hand_v1.pt holds demonstrations of hand_v1, not of hand_v0"),
-        (
-            {"demonstrations.episodes": 7},
-            "there are 6 demonstrations of hand_v1, 7 were asked for",
-        ),
+        ({"demonstrations.episodes": 7}, "there are 6 demonstrations of hand_v1, 7 were asked for"),
         (
             {"demonstrations.file": "none.pt"},
             r"demonstrations.file=none.pt cannot be read \(no such file or directory\): `torchrl-her record "
@@ -309,5 +289,4 @@ def test_what_cannot_be_beside_them(file: str, options: dict[str, Any], message:
 def test_goals_are_proposed_beside_them(file: str) -> None:
     components = build(small(**asked(file), algo="her", behavior="uniform_achieved"))
     components.trainer().run(800)
-    assert components.behavior is not None
     assert components.behavior.memory.sizes[0] > 0

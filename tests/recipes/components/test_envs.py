@@ -16,21 +16,20 @@ from torchrl_her_envs import BitFlip, Chain, TreasureHunt, goal_env
 from torchrl_her_recipes import build, resume, run
 from torchrl_her_recipes.cli import main
 
-from ..small import overrides, small
+from ..small import assert_same_runs, overrides, small
 
 FINE = {"name": "fine", "observation": [0], "achieved_goal": [0], "desired_goal": [1]}
 
 
 @pytest.mark.parametrize(
-    ("task", "options", "kind"),
+    ("task", "options", "algo", "kind"),
     [
-        ("bit_flip", {"bits": 5, "useless_action": True}, BitFlip),
-        ("treasure_hunt", {"step": 10}, TreasureHunt),
-        ("chain", {"length": 6, "forward_probability": 0.9}, Chain),
+        ("bit_flip", {"bits": 5, "useless_action": True}, "filtered_her", BitFlip),
+        ("treasure_hunt", {"step": 10}, "no_hindsight", TreasureHunt),
+        ("chain", {"length": 6, "forward_probability": 0.9}, "her", Chain),
     ],
 )
-@pytest.mark.parametrize("algo", ["no_hindsight", "her", "filtered_her"])
-def test_small_worlds_train_by_name(task: str, options: dict[str, Any], kind: type, algo: str) -> None:
+def test_small_worlds_train_by_name(task: str, options: dict[str, Any], algo: str, kind: type) -> None:
     components = build(small(task=task, options=options, algo=algo, num_runs=2))
     assert isinstance(goal_env(components.env), kind)
     assert isinstance(components.loss, DQNLoss)
@@ -59,18 +58,15 @@ def test_small_worlds_go_on_from_checkpoints_bit_for_bit(tmp_path: Path) -> None
     options: dict[str, Any] = {"task": "treasure_hunt", "options": {"step": 20}, "algo": "filtered_her"}
     run(build(small(**options, epochs=3)), tmp_path / "whole", progress=False)
     run(build(small(**options, epochs=2)), tmp_path / "half", progress=False)
-    config = tmp_path / "half" / "config.yaml"
-    config.write_text(config.read_text().replace("epochs: 2", "epochs: 3"))
-    rows = resume(tmp_path / "half", progress=False).rows
-    whole = yaml.safe_load((tmp_path / "whole" / "config.yaml").read_text())
-    assert whole["task"]["options"] == {"step": 20}
-    assert rows[-1]["q"] == run(build(small(**options, epochs=3)), progress=False).rows[-1]["q"]
+    resume(tmp_path / "half", options={"epochs": 3}, progress=False)
+    config = yaml.safe_load((tmp_path / "half" / "config.yaml").read_text())
+    assert config["task"]["options"] == {"step": 20}
+    assert_same_runs(tmp_path / "whole", tmp_path / "half")
 
 
 def test_goals_on_a_line_may_be_preferred() -> None:
     components = build(small(task="treasure_hunt", algo="her_ibs"))
     assert isinstance(components.buffer.writer.weights, GoalHistogram)
-    assert components.goal_target is not None
     assert components.goal_target.shape == (20,)
     assert run(components, progress=False).rows[-1]["kl"] >= 0
 
@@ -79,16 +75,13 @@ def test_goals_on_a_line_may_be_preferred() -> None:
     ("learner", "loss"), [("td3", TD3Loss), ("sac", SACLoss), ("redq", SACLoss), ("tqc", TQCLoss)]
 )
 def test_other_learners_train_by_name(learner: str, loss: type, tmp_path: Path) -> None:
-    recipe = small(algo="filtered_her", learner=learner)
-    components = build(recipe)
+    components = build(small(algo="filtered_her", learner=learner, epochs=1))
     assert isinstance(components.loss, loss)
     before = torch.cat([p.detach().flatten().clone() for p in components.actor.parameters()])
     rows = run(components, tmp_path / "run", progress=False).rows
     after = torch.cat([p.detach().flatten() for p in components.actor.parameters()])
     assert not torch.equal(before, after)
     assert rows[-1]["loss_qvalue"] > 0
-    again = run(build(recipe), progress=False).rows
-    assert [row["q"] for row in again] == [row["q"] for row in rows]
 
 
 @pytest.mark.parametrize(
@@ -99,13 +92,6 @@ def test_other_learners_train_by_name(learner: str, loss: type, tmp_path: Path) 
             {"task": "hand_v0", "learner": "dqn"},
             "continuous actions: choose ddpg or td3 or sac or redq or tqc",
         ),
-        (
-            {"task": "bit_flip", "options": {"bots": 3}},
-            "bit_flip takes no option 'bots'; its options are bits",
-        ),
-        ({"options": {"bits": 3}}, "hand_v0 takes no option 'bits'"),
-        ({"task": "chain", "options": 7}, "task.options must be a mapping of options by name, got 7"),
-        ({"task": "chain", "threshold": 0.1}, "threshold=0.1 has no effect with task=chain"),
         ({"task": "bit_flip", "algo": "cher"}, "bit_flip has no curriculum"),
         ({"task": "treasure_hunt", "algo": "cher", "curriculum": [{"name": "all"}]}, "is no stage"),
         (
@@ -122,19 +108,6 @@ def test_other_learners_train_by_name(learner: str, loss: type, tmp_path: Path) 
 def test_what_cannot_be_is_said_in_a_line(options: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         build(small(**options))
-
-
-def test_unknown_names_list_what_there_is() -> None:
-    with pytest.raises(
-        ValueError,
-        match=r"unknown task 'hand_v9'; did you mean hand_v0. The tasks are hand_reach.*chain, or gym:ID",
-    ):
-        small(task="hand_v9")
-    message = "learner must be one of ddpg, td3, sac, redq, tqc, dqn, auto, got 'ppo'"
-    with pytest.raises(ValueError, match=message):
-        small(learner="ppo")
-    with pytest.raises(ValueError, match="curriculum must be 'task' or a YAML file with a list of stages"):
-        small(curriculum="nowhere.yaml")
 
 
 def test_a_curriculum_comes_from_a_file(tmp_path: Path) -> None:

@@ -22,7 +22,6 @@ KEYS = ("observation", "desired_goal")
 def trained(**options: Any) -> tuple[Components, RunningNorm, NormalizedPolicy]:
     components = build(small(**{"normalize": True, "epochs": 1, "algo": "her", **options}))
     run(components, progress=False)
-    assert components.norm is not None
     assert isinstance(components.actor, NormalizedPolicy)
     return components, components.norm, components.actor
 
@@ -64,12 +63,10 @@ def test_q_and_its_bias_are_of_normalized_states() -> None:
     rollout = play_greedily(components, components.eval_env, 0)
     start = rollout[:, 0]
     value = critic_value(components.loss, norm(start))
-    assert value is not None
     measured = measure(components, rollout)
     torch.testing.assert_close(measured["q"], value.mean().view(1))
     torch.testing.assert_close(measured["q_bias"], (value.mean() - measured["return"]).view(1))
     other = critic_value(components.loss, start)
-    assert other is not None
     assert not torch.allclose(value, other)
 
 
@@ -98,7 +95,6 @@ def test_normalization_is_an_option() -> None:
     assert not isinstance(components.actor, NormalizedPolicy)
     assert len(components.buffer.transform) == 0
     norm = build(small(normalize=True, normalize_clip=3.0)).norm
-    assert norm is not None
     assert norm.clip == 3.0
     with pytest.raises(ValueError, match=r"normalize_clip must be above 0, got 0\.0"):
         make_recipe(normalize=True, normalize_clip=0.0)
@@ -128,7 +124,6 @@ def test_inputs_of_a_stage_are_normalized_by_the_rows_of_that_stage() -> None:
 
 def test_a_stage_begins_with_the_statistics_of_what_still_means_the_same() -> None:
     components, norm, _ = trained(task="hand_v1", algo="cher", num_runs=2, window=10)
-    assert components.curriculum is not None
     before = norm.n.clone()
     samples = torch.tensor([[0.0], [1.0]]).expand(2, 10)
     (line,) = move_on(components, components.curriculum, samples, 100)

@@ -51,7 +51,6 @@ def test_what_cannot_be_is_refused_by_name(options: dict[str, Any], message: str
 def test_the_options_of_a_teacher_arrive() -> None:
     options = {"progress_memory": 50.0, "even_share": 0.5, "least_progress": 0.1}
     state = build(small(task="hand_v1", algo="cher", order="teacher_student", **options)).curriculum
-    assert state is not None
     assert isinstance(state.progress, TeacherStudent)
     assert (state.progress.memory, state.progress.uniform_share, state.progress.still) == (50.0, 0.5, 0.1)
 
@@ -68,7 +67,6 @@ def test_an_order_of_ones_own_moves_runs(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setitem(ORDER, "soon", Soon)
     components = build(small(task="hand_v1", algo="cher", order="soon", stay=3, epsilon_start=0.4))
     state, failures = components.curriculum, torch.zeros(1, 4)
-    assert state is not None
     assert [len(move_on(components, state, failures, 0)) for _ in range(4)] == [0, 0, 1, 0]
     assert state.at_the_top(0)
     assert components.exploration.epsilon.tolist() == [1.0]  # it has no option stage_epsilon

@@ -38,6 +38,7 @@ from ..small import small
         ({"goal_sources": "actual"}, r"must be numbers of goals by source, as in .*, got 'actual'"),
         ({"goal_sources": {}}, r"must be numbers of goals by source, .*, got \{\}"),
         ({"goal_sources": {"actual:2": None}}, "goal_sources needs a space behind each colon, as in "),
+        ({"curriculum": "nowhere.yaml"}, "curriculum must be 'task' or a YAML file with a list of stages"),
         ({"sampler": "best"}, "sampler must be one of prioritized, uniform, got 'best'"),
         ({"threshold": -0.1}, "threshold must be above 0, got -0.1"),
         ({"batch_size": 256, "buffer_size": 100}, "batch_size=256 must fit buffer_size=100"),
@@ -139,22 +140,13 @@ def test_other_options_run(options: dict[str, Any]) -> None:
     assert torch.tensor(values).isfinite().all()
 
 
-def test_schaul_s_alpha_is_halved_because_errors_come_squared() -> None:
-    assert build(small(priority_alpha=0.6)).buffer.sampler.alpha == pytest.approx(0.3)
-
-
-def test_stored_rows_hold_nothing_of_the_real_goal() -> None:
-    components = build(small(epochs=1))
-    run(components, progress=False)
-    rows = components.buffer[:]
-    assert "state" not in rows.keys()
-    assert torch.equal(rows["desired_goal"], rows["next", "desired_goal"])
-
-
-def test_the_stored_reward_is_the_environment_s() -> None:
+def test_stored_rows_hold_the_environment_s_reward_and_nothing_of_the_real_goal() -> None:
     components = build(small(epochs=1, task="hand_v2", normalize=False))
     run(components, progress=False)
-    after = components.buffer[:]["next"]
+    rows = components.buffer[:]
+    after = rows["next"]
+    assert "state" not in rows.keys()
+    assert torch.equal(rows["desired_goal"], after["desired_goal"])
     ball = after["observation"][:, 5:7]
     reward = components.env.compute_reward(ball, after["desired_goal"])
     assert torch.equal(after["reward"], reward)
@@ -167,12 +159,7 @@ def test_the_stored_reward_is_the_environment_s() -> None:
 def test_td3_may_take_the_place_of_ddpg() -> None:
     components = build(small(epochs=1))
     actor = components.actor
-    loss = TD3Loss(
-        actor,
-        make_critic((9, 2), 3),
-        bounds=(-1.0, 1.0),
-        num_qvalue_nets=2,
-    )
+    loss = TD3Loss(actor, make_critic((9, 2), 3), bounds=(-1.0, 1.0), num_qvalue_nets=2)
     loss.make_value_estimator(gamma=0.98)
     components.loss, components.critic = loss, None
     components.optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3)
@@ -236,18 +223,14 @@ def test_gradient_steps_are_fused_unless_told_otherwise(
         assert type(components.learner()) is kind
 
 
-def test_where_they_cannot_be_fused_the_loss_is_used() -> None:
-    components = build(small())
-    components.loss.loss_function = "smooth_l1"
-    assert isinstance(components.learner(), LossLearner)
-
-
-def test_compiling_what_cannot_be_is_refused() -> None:
-    components = build(small(compile="always"))
-    components.loss.loss_function = "smooth_l1"
+def test_where_they_cannot_be_fused_the_loss_is_used_unless_compiled_steps_are_asked_for() -> None:
+    auto, always = (build(small(compile=choice)) for choice in ("auto", "always"))
+    for components in (auto, always):
+        components.loss.loss_function = "smooth_l1"
+    assert isinstance(auto.learner(), LossLearner)
     message = "compile=always is not supported here: loss_function='smooth_l1'; choose compile=auto"
     with pytest.raises(ValueError, match=message):
-        components.learner()
+        always.learner()
 
 
 def test_without_a_compiler_it_warns_and_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:

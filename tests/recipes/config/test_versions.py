@@ -16,8 +16,7 @@ INSTALLED = {"torch": "2.14.1", "tensordict": "0.14.3", "torchrl": "0.14.1"}
 
 
 @pytest.mark.parametrize(
-    "given",
-    [{"torch": "2.13.0+cpu"}, {"torch": "2.16.0"}, {"torch": "2.16.0.dev20260801"}, {"torch": "3.0"}],
+    "given", [{"torch": "2.13.0+cpu"}, {"torch": "2.16.0"}, {"torch": "2.16.0.dev20260801"}, {"torch": "3.0"}]
 )
 def test_a_version_outside_of_its_range_is_named_with_the_remedy(given: dict[str, str]) -> None:
     shown = given["torch"].split("+")[0]

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from torchrl_her_envs import TASKS, make_env
+from torchrl_her_envs import make_env
 from torchrl_her_recipes import PolicyInfo, load_policy
 from torchrl_her_recipes.policies.info import describe_env
 
@@ -88,12 +88,3 @@ def test_another_task_is_refused_with_both_widths() -> None:
     four.check_plays(make_env("bit_flip", bits=4), "four")
     with pytest.raises(ValueError, match="action of 4 choices, and five has .* and action of 5 choices"):
         four.check_plays(make_env("bit_flip", bits=5), "five")
-
-
-def test_the_policies_of_the_package_fit_their_tasks() -> None:
-    for task in TASKS:
-        own = load_policy(task).info
-        assert own.task == task
-        assert own.learner == "ddpg"
-        assert own.success > 0.5
-        own.check_plays(make_env(task), task)

@@ -12,12 +12,7 @@ import pytest
 from torchrl_her_envs import make_env
 from torchrl_her_recipes import make_recipe
 from torchrl_her_recipes.cli.overrides import parse_override, sweep
-from torchrl_her_recipes.policies.model_card import (
-    card_path,
-    check_free,
-    training_command,
-    write_model_card,
-)
+from torchrl_her_recipes.policies.model_card import card_path, check_free, training_command, write_model_card
 
 from .tiny import needs_onnx, tiny_policy
 
@@ -29,12 +24,7 @@ from .tiny import needs_onnx, tiny_policy
         {"task": "bit_flip", "algo": "her", "learner": "dqn", "task.options.bits": 8},
         {"task": "hand_v0", "algo": "her", "learner": "sac", "critics": 3, "clamp_targets": True},
         {"task": "hand_v2", "algo": "cher", "curriculum": make_env("hand_v1").stages()},
-        {
-            "task": "chain",
-            "algo": "her",
-            "behavior": "mega",
-            "goal_sources": {"future": 3, "final": 1},
-        },
+        {"task": "chain", "algo": "her", "behavior": "mega", "goal_sources": {"future": 3, "final": 1}},
     ],
     ids=lambda options: options["task"],
 )

@@ -28,7 +28,7 @@ from torchrl_her_recipes.policies.network import ScaledActions
 from torchrl_her_recipes.runs.policy_file import read_policy, write_policy
 
 from ...envs.gym.walk import Walk
-from ..small import small
+from ..small import Refused, small
 from .tiny import needs_onnx, states, tiny_policy
 
 OTHERS = {"fetch_push": "", "fetch_pick_and_place": "", "panda_pick_and_place": "panda_gym"}  # and modules
@@ -127,24 +127,26 @@ def test_policies_of_other_packages_tasks_are_found_by_the_task_and_stay_at_its_
 def test_trained_policies_are_as_good_as_they_say(task: str) -> None:
     """300 other episodes; five standard deviations of room."""
     trained = load_policy(task)
-    assert trained.info.task == task
+    assert (trained.info.task, trained.info.learner) == (task, "ddpg")
     env = make_env(task, num_envs=300, seed=99)
     measured = float(success(evaluate(env, trained, max_steps=env.max_steps)).float().mean())
     assert measured > trained.info.success - 5 * 0.029
     assert measured > 0.3
+    assert trained.info.success > 0.5
 
 
-def test_a_task_is_played_at_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_task_is_played_at_once(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], refused: Refused
+) -> None:
     out = tmp_path / "hand_v1.gif"
     assert main(["play", "hand_v1", "--out", str(out), "--goals", "2", "--size", "64"]) == 0
     assert out.stat().st_size > 1_000
     assert "of 2 goals achieved" in capsys.readouterr().out
-    assert main(["play", "hand_v9"]) == 2
-    assert "nor the file of an exported policy, nor one of the trained policies" in capsys.readouterr().err
+    assert "nor the file of an exported policy, nor one of the trained policies" in refused("play", "hand_v9")
 
 
 def test_what_export_wrote_is_played(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], refused: Refused
 ) -> None:
     monkeypatch.chdir(tmp_path)
     run(build(small(task="hand_v0", epochs=1, pictures=True)), "run", progress=False)
@@ -169,16 +171,14 @@ def test_what_export_wrote_is_played(
         ("moved.safetensors", "is not an exported policy: `torchrl-her export RUN` writes one"),
         ("notes.safetensors", "cannot be read: its header must have at most 4,194,304 bytes, got"),
     ):
-        assert main(["play", name]) == 2
-        assert capsys.readouterr().err.startswith(f"torchrl-her: {name} {why}")
-    assert main(["export", "run", "--out", "mine.pt"]) == 2
+        assert refused("play", name).startswith(f"torchrl-her: {name} {why}")
     said = "a policy's file must end with .safetensors or .onnx, got 'mine.pt'"
-    assert said in capsys.readouterr().err
+    assert said in refused("export", "run", "--out", "mine.pt")
 
 
 @needs_onnx
 def test_on_the_command_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], refused: Refused
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert main(["export", "hand_reach", "--format", "onnx"]) == 0
@@ -187,12 +187,8 @@ def test_on_the_command_line(
     assert main(["export", "hand_reach", "--out", "other.safetensors", "--no-card"]) == 0
     assert not Path("other.md").exists()
     assert load_policy("other.safetensors").info.success == 1.0
-    capsys.readouterr()
     for wrong, message in (
-        (
-            ["hand_reach.onnx", "--out", "new.safetensors"],
-            "hand_reach.onnx is for onnxruntime and cannot",
-        ),
+        (["hand_reach.onnx", "--out", "new.safetensors"], "hand_reach.onnx is for onnxruntime and cannot"),
         (["other.safetensors"], "other.safetensors would be replaced by itself: give --out or --format onnx"),
         (
             ["other.safetensors", "--out", "a.safetensors", "--run", "1"],
@@ -208,96 +204,77 @@ def test_on_the_command_line(
         ),
         (["nowhere"], "nowhere is neither the folder of a run, nor the file of an exported policy"),
     ):
-        assert main(["export", *wrong]) == 2
-        said = capsys.readouterr().err
-        assert message in said
-        assert said.count("\n") == 1
+        assert message in refused("export", *wrong)
     Path("a.md").write_text("mine")
-    assert main(["export", "other.safetensors", "--out", "a.onnx"]) == 2
-    assert "a.md exists and is no model card that export wrote" in capsys.readouterr().err
+    said = refused("export", "other.safetensors", "--out", "a.onnx")
+    assert "a.md exists and is no model card that export wrote" in said
     assert sorted(path.name for path in tmp_path.iterdir()) == [
         "a.md", "hand_reach.md", "hand_reach.onnx", "other.safetensors"
     ]  # fmt: skip
     for command in (["play", "hand_reach.onnx"], ["record", "hand_reach", "--policy", "hand_reach.onnx"]):
-        assert main(command) == 2
-        assert "hand_reach.onnx is for onnxruntime and cannot be loaded" in capsys.readouterr().err
+        assert "hand_reach.onnx is for onnxruntime and cannot be loaded" in refused(*command)
 
 
 @pytest.mark.parametrize("missing", ["onnx", "onnxruntime", "onnxscript"])
 def test_without_the_extra_nothing_is_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], missing: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refused: Refused, missing: str
 ) -> None:
     monkeypatch.setitem(sys.modules, missing, None)
-    assert main(["export", "hand_reach", "--out", str(tmp_path / "a.onnx")]) == 2
-    said = capsys.readouterr().err
-    assert said == "torchrl-her: ONNX files need onnx, onnxruntime and onnxscript: pip install '.[onnx]'\n"
+    said = "torchrl-her: ONNX files need onnx, onnxruntime and onnxscript: pip install '.[onnx]'\n"
+    assert refused("export", "hand_reach", "--out", str(tmp_path / "a.onnx")) == said
     assert list(tmp_path.iterdir()) == []
-
-
-def _wide(state: dict[str, Any]) -> None:
-    state["recipe"]["learner"]["hidden"] = 10_000_000
-
-
-def _not_finite(state: dict[str, Any]) -> None:
-    state["weights"]["module.layers.3.bias"][:] = torch.nan
-
-
-def _no_widths(state: dict[str, Any]) -> None:
-    del state["info"]["widths"]
-
-
-def _newer(state: dict[str, Any]) -> None:
-    state["recipe"]["learner"]["warp"] = 9
-
-
-def _other_learner(state: dict[str, Any]) -> None:
-    state["recipe"]["learner"]["name"] = "theirs"
-
-
-def _no_weights(state: dict[str, Any]) -> None:
-    state["weights"].clear()
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (_wide, "must be (1, 7, 10000000), got (1, 7, 64)"),
-        (_not_finite, "weights must be finite, got others in module.layers.3.bias"),
-        (_newer, "no option 'learner.warp'; the options of learner are"),
         (
-            _no_widths,
+            lambda own: own["recipe"]["learner"].update(hidden=10_000_000),
+            "must be (1, 7, 10000000), got (1, 7, 64)",
+        ),
+        (
+            lambda own: own["weights"]["module.layers.3.bias"].fill_(torch.nan),
+            "weights must be finite, got others in module.layers.3.bias",
+        ),
+        (
+            lambda own: own["recipe"]["learner"].update(warp=9),
+            "no option 'learner.warp'; the options of learner are",
+        ),
+        (
+            lambda own: own["info"].pop("widths"),
             "its info is damaged: PolicyInfo.__init__() missing 1 required keyword",
         ),
-        (_other_learner, "learner must be one of ddpg, td3, sac, redq, tqc, dqn, auto, got 'theirs'"),
-        (_no_weights, "these are not the weights of an actor of learner="),
+        (
+            lambda own: own["recipe"]["learner"].update(name="theirs"),
+            "learner must be one of ddpg, td3, sac, redq, tqc, dqn, auto, got 'theirs'",
+        ),
+        (lambda own: own["weights"].clear(), "these are not the weights of an actor of learner="),
     ],
 )
 def test_files_that_somebody_made_give_one_line(
+    change: Callable[[dict[str, Any]], Any],
+    message: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    change: Callable[[dict[str, Any]], None],
-    message: str,
+    refused: Refused,
 ) -> None:
     monkeypatch.chdir(tmp_path)
     export_policy("hand_reach", "good.safetensors", card=False)
     description, weights = read_policy(Path("good.safetensors"))
     change({**description, "weights": weights})
     write_policy(Path("bad.safetensors"), weights, description)
-    assert main(["play", "bad.safetensors"]) == 2
-    said = capsys.readouterr().err
+    said = refused("play", "bad.safetensors")
     assert said.startswith("torchrl-her: bad.safetensors is not an exported policy: ")
     assert message in said
-    assert said.count("\n") == 1
 
 
 def test_a_policy_that_no_longer_fits_its_task_is_not_played(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refused: Refused
 ) -> None:
     robot = make_env("robot_v0", num_envs=2)
     monkeypatch.setattr(policy.TaskEnvs, "make", lambda *_args, **_options: robot)
-    assert main(["play", "hand_reach", "--out", str(tmp_path / "a.gif")]) == 2
-    assert "a policy of hand_reach cannot play hand_reach: it has other widths" in capsys.readouterr().err
+    said = refused("play", "hand_reach", "--out", str(tmp_path / "a.gif"))
+    assert "a policy of hand_reach cannot play hand_reach: it has other widths" in said
 
 
 def test_predict_takes_what_gymnasium_shows() -> None:

@@ -17,6 +17,7 @@ from torchrl_her_recipes.cli import main
 from torchrl_her_recipes.reports import compare
 from torchrl_her_recipes.reports import page as page_module
 
+from ..small import Refused
 from .small_study import STUDY, write_run
 from .test_page import Checker, text_of
 
@@ -86,9 +87,8 @@ def test_runs_that_differ_in_their_seed_alone_are_one_case(tmp_path: Path) -> No
     (tmp_path / "made").rmdir()
     shutil.copytree(tmp_path / "sweep" / "hand_v2_g90_s0", tmp_path / "sweep" / "repeated")
     page = Path(recipes_page(tmp_path / "sweep", out=tmp_path / "page")).read_text()
-    assert (
-        re.findall(r'<span class="name">(\w+)</span>', page)[-1] == "repeated"
-    )  # its seeds are there already
+    names = re.findall(r'<span class="name">(\w+)</span>', page)
+    assert names[-1] == "repeated"  # its seeds are there already
 
 
 def recipes_page(*folders: Path, out: Path) -> str:
@@ -96,21 +96,15 @@ def recipes_page(*folders: Path, out: Path) -> str:
     return str(out / "index.html")
 
 
-def test_what_was_not_trained_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_was_not_trained_is_one_line(tmp_path: Path, refused: Refused) -> None:
     home = write_epochs(tmp_path, 1)
     (tmp_path / "empty").mkdir()
     for arguments, message in (
-        (
-            [str(tmp_path / "empty")],
-            "empty is no folder of a run: neither it nor a folder",
-        ),
+        ([str(tmp_path / "empty")], "empty is no folder of a run: neither it nor a folder"),
         ([str(home), str(tmp_path / "none")], "none is no folder of a run"),
         ([str(home), "--folder", "x"], "--folder goes with the name of a study"),
         ([str(home), "--export", "x"], "--export goes with the name of a study"),
         (["bias", str(home)], "a page is about one study or about folders of runs, got bias, "),
         ([str(home), "--follow"], "no option --follow; choose `tensorboard --logdir runs`"),
     ):
-        assert main(["report", *arguments]) == 2
-        said = capsys.readouterr().err
-        assert message in said
-        assert said.count("\n") == 1
+        assert message in refused("report", *arguments)

@@ -19,14 +19,12 @@ from ..small import small
 def trained(**options: Any) -> tuple[Components, PolicyAverage]:
     components = build(small(**{"epochs": 1, "algo": "her", **options}))
     run(components, progress=False)
-    assert components.average is not None
     return components, components.average
 
 
 def test_the_average_is_what_plays_and_is_kept(tmp_path: Path) -> None:
     components = build(small(epochs=1))
     run(components, tmp_path / "run", progress=False)
-    assert components.average is not None
     assert components.greedy is components.average.module
     _, kept = read_policy(tmp_path / "run" / "policy.safetensors")
     for name, value in components.average.module.state_dict().items():

@@ -13,14 +13,14 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 from torchrl_her import Instructiveness, enter_stage
 from torchrl_her.replay_buffers.runs import sizes_of
-from torchrl_her_envs import TASKS, Chain, base_env, make_env
-from torchrl_her_recipes import Components, Recipe, build, play, resume, run
+from torchrl_her_envs import TASKS, base_env, make_env
+from torchrl_her_recipes import Components, Recipe, build, resume, run
 from torchrl_her_recipes.cli import main
 from torchrl_her_recipes.components.curricula import read_curriculum
 from torchrl_her_recipes.runs.curriculum import move_on
 from torchrl_her_recipes.runs.folder import RunFolder
 
-from ..small import overrides, small
+from ..small import Refused, overrides, small
 
 THROWS = [name for name, task in TASKS.items() if task.throws]
 
@@ -33,7 +33,6 @@ def move(components: Components, *, run: int) -> list[str]:
     """Lets one run learn its stage."""
     samples = torch.zeros(components.recipe.run.num_runs, components.recipe.order.window)
     samples[run] = 1.0
-    assert components.curriculum is not None
     return move_on(components, components.curriculum, samples, 1_600)
 
 
@@ -41,39 +40,8 @@ def weights(components: Components) -> Tensor:
     return torch.cat([value.flatten() for value in components.actor.state_dict().values()])
 
 
-@pytest.mark.parametrize("task", THROWS)
-def test_every_throwing_task_has_a_curriculum_that_hands_over(task: str) -> None:
-    env = make_env(task, num_envs=2)
-    curriculum = read_curriculum(env.stages(), env)
-    shown = env.reset()
-    state = shown["state"]
-    reach, throw = curriculum.stages
-    grip, ball = (
-        (where * (2.0 / env.world.size) - 1.0).float() for where in (env.worlds.grip, env.worlds.ball)
-    )
-    assert state[:, list(reach.achieved_goal)].tolist() == grip.tolist()
-    assert state[:, list(reach.desired_goal)].tolist() == ball.tolist()
-    assert state[:, list(throw.achieved_goal)].tolist() == shown["achieved_goal"].tolist()
-    assert state[:, list(throw.desired_goal)].tolist() == env.worlds.goal.float().tolist()
-    # What the throw sees first is all that the reach sees, its goal included.
-    assert [*reach.observation, *reach.desired_goal] == list(throw.observation[: curriculum.first_inputs])
-
-
-def test_parts_of_the_chain_are_stages_that_end_at_the_next_one_s_start() -> None:
-    env = Chain(6, 1.0, stages=3)
-    state = env.reset()["state"][0]
-    first, second, third = read_curriculum(env.stages(), env).stages
-    assert (first.observation, first.achieved_goal) == ((0, 1), (0, 1))
-    assert (second.observation, second.achieved_goal) == ((0, 1, 2, 3), (2, 3))
-    assert (third.observation, third.achieved_goal) == ((0, 1, 2, 3, 4, 5), (4, 5))
-    assert first.threshold < 2.0  # what a single open link is away
-    assert third.threshold is None
-    for stage in (first, second, third):
-        assert state[list(stage.desired_goal)].tolist() == [1.0, 1.0]
-
-
 def test_the_guide_s_file_of_stages_is_trained_with(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refused: Refused
 ) -> None:
     guide = (Path(__file__).parents[3] / "docs" / "curriculum.md").read_text()
     (stages,) = re.findall(r"```yaml\n(# near.yaml\n.*?)```", guide, re.DOTALL)
@@ -90,9 +58,7 @@ def test_the_guide_s_file_of_stages_is_trained_with(
     Path("near.yaml").unlink()  # the run has its stages
     assert main(["train", "--resume", "out", "epochs=2"]) == 0
     Path("near.yaml").write_text(stages.replace("observation: hand,", "observation: hands,"))
-    capsys.readouterr()
-    assert main(["train", "task=hand_v1", "algo=cher", "curriculum=near.yaml"]) == 2
-    assert capsys.readouterr().err == (
+    assert refused("train", "task=hand_v1", "algo=cher", "curriculum=near.yaml") == (
         "torchrl-her: stage 'come near': observation has the unknown name 'hands'; known are 'hand', 'grip', "
         "'ball', 'ball_speed', 'hole', 'observation', 'desired_goal'\n"
     )
@@ -121,22 +87,11 @@ def test_stages_with_goals_of_one_and_of_two_numbers_train_together() -> None:
 def test_a_chain_is_climbed() -> None:
     options = {"length": 4, "stages": 2, "alternating": True}
     recipe = small(
-        task="chain",
-        options=options,
-        algo="cher",
-        epoch_frames=800,
-        epochs=8,
-        window=1,
-        frames_per_update=4,
+        task="chain", options=options, algo="cher", epoch_frames=800, epochs=8, window=1, frames_per_update=4
     )
     rows = run(build(recipe), progress=False).rows
     assert rows[0]["stage"] == 0
     assert rows[-1]["stage"] == 1
-
-
-def test_a_task_of_one_stage_has_none() -> None:
-    with pytest.raises(ValueError, match="hand_reach has no curriculum"):
-        build(small(task="hand_reach", algo="cher"))
 
 
 def test_a_run_begins_with_the_reach_and_is_measured_at_the_full_task_too(tmp_path: Path) -> None:
@@ -220,14 +175,12 @@ def test_a_run_that_was_stopped_after_a_change_goes_on_as_if_it_had_not(tmp_path
     part = build(recipe)
     resume(tmp_path / "part", components=part, progress=False)
     assert torch.equal(weights(part), weights(whole))
-    assert part.curriculum is not None
     assert part.curriculum.progress.stages == (1,)
 
 
 def test_runs_are_guided_by_the_stage_that_they_have_learned() -> None:
     components = build(climbing(num_runs=2, guided_share=1.0, epsilon_start=0.0, epsilon_end=0.0))
     guide = components.guide
-    assert guide is not None
     trainer = components.trainer()
     trainer.epoch()
     learned = {name: value.clone() for name, value in components.greedy.state_dict().items()}
@@ -237,7 +190,6 @@ def test_runs_are_guided_by_the_stage_that_they_have_learned() -> None:
         assert torch.equal(value.chunk(2)[1], learned[name].chunk(2)[1])
     rows = next(iter(components.collector))
     assert not {"state", "input", "is_init"} & set(components.buffer.storage[:].keys())
-    assert guide.guided is not None
     assert (guide.guided.chunk(2)[0] == -1).all()
     assert (guide.guided.chunk(2)[1] == 0).any()
     greedy = components.actor(rows.select("input").clone())["action"]
@@ -248,12 +200,6 @@ def test_runs_are_guided_by_the_stage_that_they_have_learned() -> None:
 def test_nobody_is_guided_unless_it_is_asked_for() -> None:
     assert build(climbing()).guide is None
     assert "is_init" not in build(climbing()).env.observation_spec.keys()
-
-
-def test_its_policy_plays_the_full_task(tmp_path: Path) -> None:
-    run(build(climbing()), tmp_path / "run", progress=False)
-    ((achieved, goals),) = play(tmp_path / "run", out=tmp_path / "play.gif", goals=2, size=64)
-    assert 0 <= achieved <= goals == 2
 
 
 def test_environments_for_evaluation_show_the_full_task() -> None:
@@ -285,4 +231,4 @@ def test_a_buffer_that_does_not_relabel_is_refused() -> None:
 
 def test_nothing_is_said_without_a_progress_bar(capsys: pytest.CaptureFixture[str]) -> None:
     run(build(climbing(success_threshold=0.01, episodes=30, window=30, compile="never")), progress=False)
-    assert capsys.readouterr().out == ""
+    assert capsys.readouterr() == ("", "")

@@ -93,7 +93,6 @@ def test_few_worlds_play_as_many_episodes_as_asked(algo: str) -> None:
 
 def test_episodes_may_ask_for_virtual_goals() -> None:
     components = build(small(task="hand_v1", algo="her", num_runs=2, virtual_goals=True))
-    assert components.virtual_env is not None
     before = at_virtual_goals(components, 0)
     assert all(value.isnan().all() for value in before.values())
     assert list(before) == ["virtual_success", "virtual_q", "virtual_q_bias"]
@@ -121,7 +120,6 @@ def test_virtual_goals_are_asked_for_in_every_round() -> None:
     components = build(small(task="hand_v0", algo="her", virtual_goals=True))
     components.trainer().epoch()
     env = components.virtual_env
-    assert env is not None
     assert ask_for_virtual_goals(components, env, 1) == [True]
     own = rows_of_run(components.buffer, 0)
     known = own["desired_goal"][own["virtual"].squeeze(-1)]
@@ -134,7 +132,6 @@ def test_with_stages_for_episodes_they_are_goals_of_the_last() -> None:
     components = build(small(task="hand_v1", algo="unfiltered_cher", order="all_at_once", virtual_goals=True))
     components.trainer().epoch()
     env = components.virtual_env
-    assert env is not None
     assert ask_for_virtual_goals(components, env, 1) == [True]
     own = rows_of_run(components.buffer, 0)
     last = own["virtual"].squeeze(-1) & (own["stage"].squeeze(-1) == 1)
@@ -143,7 +140,6 @@ def test_with_stages_for_episodes_they_are_goals_of_the_last() -> None:
 
 def test_virtual_goals_of_lower_stages_are_not_those_of_the_task() -> None:
     components = build(small(task="hand_v1", algo="cher", num_runs=2, virtual_goals=True))
-    assert components.curriculum is not None
     components.trainer().epoch()
     components.curriculum.progress.set_stage(1, 1)
     assert at_virtual_goals(components, 1)["virtual_success"].isnan().tolist() == [True, False]

@@ -32,8 +32,3 @@ def test_on_a_terminal_there_is_a_bar(
     said = capsys.readouterr().err
     assert "480/480" in said
     assert "epoch 1 of 1" not in said
-
-
-def test_without_progress_nothing_is_said(capsys: pytest.CaptureFixture[str]) -> None:
-    run(build(small(epochs=1, **SHORT)), progress=False)
-    assert capsys.readouterr() == ("", "")

@@ -17,22 +17,12 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from torchrl_her import load_checkpoint, save_checkpoint
-from torchrl_her_recipes import (
-    Callback,
-    Components,
-    EarlyStopping,
-    Recipe,
-    RunView,
-    build,
-    cli,
-    resume,
-    run,
-)
+from torchrl_her_recipes import Callback, Components, EarlyStopping, Recipe, RunView, build, cli, resume, run
 from torchrl_her_recipes.runs import state as run_state
 from torchrl_her_recipes.runs.folder import RunFolder
 
 from ...forks import server
-from ..small import assert_same, assert_same_runs, small
+from ..small import Refused, assert_same, assert_same_runs, small
 from .killed import is_killed
 
 KILLS = 20
@@ -267,10 +257,7 @@ def test_epochs_extend_a_finished_run_and_an_interrupted_one(
             ["epochs=4", "learner.gamma=0.9"],
             "keep_checkpoints, keep_buffer, pictures, log only; learner.gamma=0.9 would change its training",
         ),
-        (
-            ["preset=demo"],
-            "keep_buffer, pictures, log only; preset=demo would change its training so far",
-        ),
+        (["preset=demo"], "keep_buffer, pictures, log only; preset=demo would change its training so far"),
         (["epoch=4"], "no option 'epoch'; did you mean epochs?"),
         (["epochs=4", "run.epochs=5"], "epochs=4 and run.epochs=5 set the same option"),
         (["epochs=4,5"], "epochs must be one value, got 4,5"),
@@ -279,24 +266,15 @@ def test_epochs_extend_a_finished_run_and_an_interrupted_one(
     ],
 )
 def test_what_cannot_extend_a_run_is_named_and_changes_nothing(
-    arguments: list[str],
-    message: str,
-    ended: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    arguments: list[str], message: str, ended: Path, monkeypatch: pytest.MonkeyPatch, refused: Refused
 ) -> None:
     monkeypatch.chdir(ended.parent)
     before = {path: path.stat().st_mtime_ns for path in ended.rglob("*")}
-    assert cli.main(["train", "--resume", "run", *arguments]) == 2
-    said = capsys.readouterr().err
-    assert message in said
-    assert len(said.splitlines()) == 1
+    assert message in refused("train", "--resume", "run", *arguments)
     assert {path: path.stat().st_mtime_ns for path in ended.rglob("*")} == before
 
 
-def test_a_finished_run_has_no_buffer_and_cannot_have_more_epochs(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_finished_run_has_no_buffer_and_cannot_have_more_epochs(tmp_path: Path, refused: Refused) -> None:
     recipe = small(epochs=2, keep_buffer=False)
     run(build(recipe), tmp_path, progress=False)
     assert [path.name for path in tmp_path.glob("checkpoint*")] == ["checkpoint.pt"]
@@ -307,8 +285,7 @@ def test_a_finished_run_has_no_buffer_and_cannot_have_more_epochs(
         "replay buffer; only runs trained with keep_buffer=true keep it when they have finished\n"
     )
     for arguments in (["epochs=3"], ["epochs=3", "keep_buffer=true"], ["keep_buffer=true"]):
-        assert cli.main(["train", "--resume", str(tmp_path), *arguments]) == 2
-        assert capsys.readouterr().err == said
+        assert refused("train", "--resume", str(tmp_path), *arguments) == said
     with pytest.raises(ValueError, match="cannot be extended beyond 2 epochs"):
         resume(tmp_path, components=build(recipe.replace(epochs=3)))
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
@@ -356,14 +333,11 @@ def test_a_default_run_is_small_when_it_has_finished_and_ends_as_one_that_keeps_
     assert (tmp_path / "small" / "checkpoint.pt").stat().st_size < 2_000_000
 
 
-def test_without_a_checkpoint_a_run_cannot_go_on(
-    ended: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_a_checkpoint_a_run_cannot_go_on(ended: Path, tmp_path: Path, refused: Refused) -> None:
     folder = copytree(ended, tmp_path / "run")
     (folder / "checkpoint.pt").unlink()
-    assert cli.main(["train", "--resume", str(folder), "epochs=3"]) == 2
     said = f"torchrl-her: the run in {folder} cannot be resumed: checkpoint.pt is missing\n"
-    assert capsys.readouterr().err == said
+    assert refused("train", "--resume", str(folder), "epochs=3") == said
 
 
 def test_options_and_components_are_not_given_together(ended: Path) -> None:
@@ -453,15 +427,14 @@ def test_a_full_disk_at_the_end_says_what_is_missing(tmp_path: Path) -> None:
 
 
 def test_a_checkpoint_with_other_parts_is_refused_in_one_line(
-    ended: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ended: Path, tmp_path: Path, refused: Refused
 ) -> None:
     copytree(ended, tmp_path / "run")
     path = tmp_path / "run" / "checkpoint.pt"
     state = load_checkpoint(path)
     del state["worlds"]
     save_checkpoint({**state, "recipe": {}}, path)
-    assert cli.main(["train", "--resume", str(tmp_path / "run"), "epochs=3"]) == 2
-    assert capsys.readouterr().err == (
+    assert refused("train", "--resume", str(tmp_path / "run"), "epochs=3") == (
         f"torchrl-her: {path} is not of this run: it has other parts (recipe, worlds): resume it with the "
         "version of torchrl-her and the components that it was written with\n"
     )

@@ -82,7 +82,6 @@ def test_batches_are_read_as_one_in_the_order_of_their_seeds(tmp_path: Path) -> 
     assert [row["run"] for row in rows] == [row["seed"] for row in rows] == list(range(12))
     assert {row["epoch"] for row in rows} == {1}
     goals = batches.goal_map()
-    assert goals is not None
     assert goals.counts.shape == (12, 2, 2)
     np.testing.assert_array_equal(goals.share, [[0.25, 0.25], [0.25, 0.25]])
 
@@ -112,13 +111,6 @@ def test_a_batch_whose_configuration_is_torn_is_as_planned(tmp_path: Path) -> No
     home.policy.unlink()
     (job,) = Plan(plan_batches("her", FIVE, tmp_path)).jobs
     assert job.recipe == FIVE
-
-
-def test_a_run_without_its_policy_was_killed_before_its_end(tmp_path: Path) -> None:
-    leave(tmp_path, FIVE, epochs=2)
-    assert Batches(tmp_path).is_done
-    RunFolder(tmp_path).policy.unlink()
-    assert not Batches(tmp_path).is_done
 
 
 def test_nothing_begun_is_nothing_to_show(tmp_path: Path) -> None:

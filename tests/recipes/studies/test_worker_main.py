@@ -23,9 +23,6 @@ def test_told_to_stop_between_two_jobs_it_ends_without_a_word(tmp_path: Path) ->
     with subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE
     ) as process:
-        assert process.stdin is not None
-        assert process.stdout is not None
-        assert process.stderr is not None
         pickle.dump(job.to_plain(), process.stdin)
         process.stdin.flush()
         assert pickle.load(process.stdout) == Outcome()

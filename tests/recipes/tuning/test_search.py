@@ -124,10 +124,7 @@ def test_a_sampler_whose_package_is_missing_names_the_remedy(monkeypatch: pytest
 def test_what_a_search_was_begun_with_is_asked_for_again(tmp_path: Path) -> None:
     go_on(small_search(), tmp_path, 1)
     for other, said in (
-        (
-            small_search(sampler="random"),
-            "a search with --sampler=tpe, not --sampler=random: repeat",
-        ),
+        (small_search(sampler="random"), "a search with --sampler=tpe, not --sampler=random: repeat"),
         (small_search(gamma=0.95), "a search with gamma=0.9, not gamma=0.95: repeat its options"),
         (small_search(RANGE), "a search with space.learning_rate={'kind': 'log_float', .*, not space.learn"),
     ):

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from torchrl_her_envs import TASKS, ThrowingEnv, make_env, render, to_pixel
+from torchrl_her_envs.common.goal_env import choose_indices
 
 SIZE = 160
 METRES = 6.0  # side of the screen
@@ -50,27 +51,17 @@ def test_every_task_draws(name):
 def test_the_environments_that_are_asked_for(worlds, shape):
     env = make_env("hand_v1", num_envs=3)
     env.reset()
-    assert render(env, worlds, size=SIZE).shape == shape
-    assert env.render(worlds, size=SIZE).equal(render(env, worlds, size=SIZE))
-
-
-def test_pictures_come_in_the_order_of_the_environments():
-    env = make_env("hand_v1", num_envs=3)
-    env.reset()
-    pictures = render(env, [2, 0], size=SIZE)
-    assert pictures[0].equal(render(env, 2, size=SIZE))
-    assert pictures[1].equal(render(env, 0, size=SIZE))
+    pictures = render(env, worlds, size=SIZE)
+    assert pictures.shape == shape
+    assert env.render(worlds, size=SIZE).equal(pictures)
+    for picture, world in zip(pictures.view(-1, SIZE, SIZE, 3), choose_indices(3, worlds), strict=True):
+        assert picture.equal(render(env, world, size=SIZE))
 
 
 def test_the_method_draws_the_first_environment_at_300_pixels():
     env = make_env("robot_v1", num_envs=2)
     env.reset()
     assert env.render().equal(render(env, 0, size=300))
-
-
-def test_a_size_that_is_too_small():
-    with pytest.raises(ValueError, match="a size of at least 32 pixels, got 31"):
-        render(make_env("hand_v1"), size=31)
 
 
 @pytest.mark.parametrize("name", ["hand_wall_v2", "robot_v2"])

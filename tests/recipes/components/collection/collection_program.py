@@ -140,7 +140,6 @@ def _normalized() -> dict[str, Any]:
     """What processes play after statistics changed; what this one would play, and would have before."""
     components = build(tagged(epsilon_start=0.0, epsilon_end=0.0, normalize=True))
     collector, norm, found = components.collector, components.norm, []
-    assert norm is not None
     for parameter in components.actor.parameters():
         parameter.data.mul_(3.0)  # so that inputs matter
     collector.reset()

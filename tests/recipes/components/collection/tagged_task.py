@@ -95,8 +95,4 @@ class TaggedTask(EnvBase):
     def _shown(self) -> dict[str, Tensor]:
         tag = torch.stack((self._block, self._place, self._episode, self._steps), -1)
         goal = wanted(self._block, self._place, self._episode)
-        return {
-            "observation": torch.cat((tag, self._action), -1),
-            "achieved_goal": tag,
-            "desired_goal": goal,
-        }
+        return {"observation": torch.cat((tag, self._action), -1), "achieved_goal": tag, "desired_goal": goal}

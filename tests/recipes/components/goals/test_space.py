@@ -20,7 +20,7 @@ from torchrl_her_recipes.components.goals.space import GoalSpace, goal_space
 from torchrl_her_recipes.config.choices.weights import Equal
 from torchrl_her_recipes.runs.goal_map import GoalMap
 
-from ...small import small
+from ...small import Refused, small
 
 
 @pytest.fixture(scope="module")
@@ -94,10 +94,13 @@ def test_sigma_shrinks_each_epoch_and_divergence_is_logged(finished: Path) -> No
     assert weights.sigma == pytest.approx(3 * 0.4 * 0.9)  # two epochs, each a root of 0.9
 
 
-def test_without_hindsight_there_is_nothing_to_tell(tmp_path: Path) -> None:
-    run(build(small(algo="no_hindsight")), tmp_path / "run", progress=False)
+def test_without_hindsight_there_is_nothing_to_tell(tmp_path: Path, refused: Refused) -> None:
+    run(build(small(algo="no_hindsight", epochs=1, pictures=True)), tmp_path / "run", progress=False)
     assert "kl" not in pd.read_csv(tmp_path / "run" / "metrics.csv").columns
+    assert (tmp_path / "run" / "curves.png").exists()
     assert not (tmp_path / "run" / "virtual_goals.png").exists()
+    said = "has no map of goals: its runs have written no virtual goals\n"
+    assert refused("plot", str(tmp_path / "run")).endswith(said)
 
 
 def test_the_map_holds_all_virtual_goals_of_each_run(finished: Path) -> None:
@@ -119,18 +122,10 @@ def test_plot_goals_draws_them_again(
         assert picture.size[0] > picture.size[1] > 300
 
 
-def test_a_run_without_a_map_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    run(build(small(algo="no_hindsight", epochs=1)), tmp_path / "run", progress=False)
-    assert main(["plot", str(tmp_path / "run")]) == 2
-    assert (
-        capsys.readouterr()
-        .err.strip()
-        .endswith("has no map of goals: its runs have written no virtual goals")
-    )
-    run(build(small(task="chain", epochs=1)), tmp_path / "boxless", progress=False)
-    (tmp_path / "boxless" / "policy.safetensors").rename(tmp_path / "policy.safetensors")
-    assert main(["plot", str(tmp_path / "boxless")]) == 2
-    assert capsys.readouterr().err.endswith("has no map of goals: it is written when a run ends\n")
-    (tmp_path / "policy.safetensors").rename(tmp_path / "boxless" / "policy.safetensors")
-    assert main(["plot", str(tmp_path / "boxless")]) == 2
-    assert "over the box that a task's goal_box() returns, and chain has none" in capsys.readouterr().err
+def test_a_run_without_a_map_is_named(tmp_path: Path, refused: Refused) -> None:
+    run(build(small(task="chain", epochs=1)), tmp_path, progress=False)
+    said = "over the box that a task's goal_box() returns, and chain has none"
+    assert said in refused("plot", str(tmp_path))
+    (tmp_path / "policy.safetensors").unlink()
+    said = "has no map of goals: it is written when a run ends\n"
+    assert refused("plot", str(tmp_path)).endswith(said)

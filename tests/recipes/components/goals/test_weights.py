@@ -16,7 +16,6 @@ from torchrl_her.goals import KernelInstructiveness, NetworkNovelty, RareGoals
 from torchrl_her.replay_buffers.runs import rows_of_run
 from torchrl_her_envs import make_env
 from torchrl_her_recipes import Components, Recipe, build, resume, run
-from torchrl_her_recipes.cli import main
 from torchrl_her_recipes.components.envs import TaskEnvs
 from torchrl_her_recipes.components.goals.space import KernelSpace, goal_space
 from torchrl_her_recipes.config.choices.weights import IBS
@@ -114,7 +113,6 @@ def test_the_kernel_s_sigma_is_the_grid_s_and_grows_with_the_root_of_the_numbers
     space = goal_space(IBS(estimator="kernel"), *throwing)
     assert isinstance(space, KernelSpace)
     grid = goal_space(IBS(), *throwing)
-    assert grid is not None
     assert space.sigma == pytest.approx(grid.sigma) == pytest.approx(0.4)
     assert space.goals.shape[1] == 2
     flipping = small(**{"task": "bit_flip", "task.options.bits": 12})
@@ -123,7 +121,6 @@ def test_the_kernel_s_sigma_is_the_grid_s_and_grows_with_the_root_of_the_numbers
     assert isinstance(many, KernelSpace)
     assert many.sigma == pytest.approx(0.2 * math.sqrt(12 / 3))
     given = goal_space(IBS(sigma=0.3), *bits)
-    assert given is not None
     assert given.sigma == pytest.approx(0.3)
 
 
@@ -133,13 +130,6 @@ def test_a_grid_over_many_numbers_is_refused_by_name() -> None:
         build(small(task="bit_flip", algo="her_ibs", estimator="grid"))
     weights = build(small(task="treasure_hunt", algo="her_ibs")).buffer.writer.weights
     assert isinstance(weights, Instructiveness)  # one number
-
-
-def test_they_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["list"]) == 0
-    listed = capsys.readouterr().out
-    for name in ("filtered_her_rare", "filtered_her_rnd", "cher_rare", "cher_rnd"):
-        assert f"  {name} " in listed
 
 
 def test_a_fetch_task_trains_with_a_curriculum_and_ibs_by_kernels() -> None:

@@ -96,10 +96,7 @@ def test_a_space_is_what_was_written(tmp_path: Path) -> None:
         ("gama: {kind: float, low: 0, high: 1}", "no option 'gama'; did you mean gamma?"),
         ("gamma: 0.9", "gamma of a space must have a kind, as in .* got 0.9"),
         ("gamma: {kind: flaot, low: 0, high: 1}", "kind of gamma must be one of .* got 'flaot'"),
-        (
-            "gamma: {kind: [float], low: 0, high: 1}",
-            r"kind of gamma must be one of .* got \['float'\]",
-        ),
+        ("gamma: {kind: [float], low: 0, high: 1}", r"kind of gamma must be one of .* got \['float'\]"),
         ("gamma: {kind: float, low: 0.9}", "gamma of kind float must have low and high, got {'kind'"),
         (
             "gamma: {kind: float, low: 0.9, hihg: 1}",
@@ -158,23 +155,11 @@ def test_what_is_no_space_is_refused_in_one_line(text: str, message: str, tmp_pa
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (
-            "gamma: {kind: float, low: 0.9, high: 1.5}",
-            "does not fit: gamma must be above 0 and below 1",
-        ),
-        (
-            "norm: {kind: choice, values: [layer, big]}",
-            "does not fit: norm must be one of none, layer",
-        ),
+        ("gamma: {kind: float, low: 0.9, high: 1.5}", "does not fit: gamma must be above 0 and below 1"),
+        ("norm: {kind: choice, values: [layer, big]}", "does not fit: norm must be one of none, layer"),
         ("quantiles: {kind: int, low: 10, high: 30}", "does not fit: learner=auto has no option quantiles"),
-        (
-            "window: {kind: int, low: 10, high: 30}",
-            "does not fit: window=10 has no effect with",
-        ),
-        (
-            "hidden: {kind: float, low: 10.5, high: 64}",
-            "does not fit: hidden must be a whole number",
-        ),
+        ("window: {kind: int, low: 10, high: 30}", "does not fit: window=10 has no effect with"),
+        ("hidden: {kind: float, low: 10.5, high: 64}", "does not fit: hidden must be a whole number"),
     ],
 )
 def test_what_the_recipe_does_not_take_is_refused(text: str, message: str, tmp_path: Path) -> None:

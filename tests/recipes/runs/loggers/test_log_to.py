@@ -147,7 +147,6 @@ class Flaky(CSVLogger):
 
 
 def open_flaky(run: RunView, frames: int) -> tuple[CSVLogger, int]:
-    assert run.folder is not None
     if frames == 0 and not Flaky.fails:
         raise ConnectionError("nobody\nthere")
     return Flaky(f"from_{frames}", str(run.folder.path)), frames
