@@ -165,16 +165,6 @@ def test_import_on_the_command_line_permits_a_module_and_what_is_in_it(
     check_permitted("mined:make")
 
 
-def test_a_torchrl_environment_of_one_s_own_trains_by_its_name(tmp_path: Path) -> None:
-    task = "tests.envs.common.own_point:Point"
-    recipe = small(task=task, algo="filtered_her", pictures=True, **TINY)
-    result = run(build(recipe), tmp_path / "run", progress=False)
-    assert result.rows[-1]["rows_virtual"] > 0
-    assert (tmp_path / "run" / "policy.gif").exists()
-    play(tmp_path / "run", out=tmp_path / "film.gif", goals=2, size=32)
-    resume(tmp_path / "run", progress=False)
-
-
 @pytest.mark.parametrize(
     "task", ["gym:torchrl_her_envs:torchrl_her/HandReach-v0", "tests.envs.common.own_point:Point"]
 )

@@ -90,8 +90,7 @@ def test_other_environments_have_none(id: str) -> None:
     assert fetch_names(id) == {}
 
 
-@pytest.mark.parametrize("suffix", [".gif", ".mp4"])
-def test_films_without_a_display(suffix: str, tmp_path: Path) -> None:
+def test_films_without_a_display(tmp_path: Path) -> None:
     pytest.importorskip("gymnasium_robotics")
     env = make_gym_env("FetchReach-v4", num_envs=2, seed=3, max_steps=3, pictures=True)
     try:
@@ -103,7 +102,7 @@ def test_films_without_a_display(suffix: str, tmp_path: Path) -> None:
     assert len(frames) == 4
     assert frames[0].shape == (64, 128, 3)
     assert frames[0].float().std() > 20  # there is something to see
-    assert write_video(frames, tmp_path / f"film{suffix}").stat().st_size > 1_000
+    assert write_video(frames, tmp_path / "film.gif").stat().st_size > 1_000
 
 
 def test_nothing_is_printed_when_they_are_made() -> None:

@@ -337,10 +337,6 @@ def test_pictures() -> None:
         env.render([3])
     with pytest.raises(ValueError, match="a picture needs a size of at least 1 pixel, got 0"):
         env.render(size=0)
-
-
-def test_environments_made_without_pictures_give_none() -> None:
-    assert not walk().can_render
     with pytest.raises(ValueError, match='pictures need render_mode="rgb_array", got None'):
         walk().render()
 
@@ -483,23 +479,6 @@ def test_goals_with_the_greatest_difference_may_be_achieved(met: Any, pairs: lis
     places = torch.tensor([[0.0], [2.0], [4.0]])
     reward = env.compute_reward(places, places.unsqueeze(1)).squeeze(-1)  # [desired, achieved]
     assert reward.eq(0).tolist() == pairs
-
-
-@pytest.mark.parametrize(
-    "judge",
-    [
-        lambda own, a, d, info: sparse(np.linalg.norm(a - d, axis=1) < 1),
-        lambda own, a, d, info: np.array([sparse((a[n] == d[n]).all()) for n in range(a.shape[0])])[:, None],
-        lambda own, a, d, info: [sparse((x == y).all()) for x, y, each in zip(a, d, info, strict=True)],
-    ],
-    ids=["axis", "rows", "infos"],
-)
-def test_a_reward_of_batches_alone_is_asked_for_batches(judge: Any) -> None:
-    env = make_gym_env("tests/Judged-v0", judge=judge)
-    assert env._reward_of.answers == "batch"
-    goals = torch.tensor([[0.0], [2.0], [2.0]])
-    assert env.compute_reward(goals, torch.tensor([2.0])).tolist() == [[-1.0], [0.0], [0.0]]
-    assert env.compute_reward(goals[0], goals[0]).tolist() == [0.0]
 
 
 def test_what_a_machine_cannot_draw_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:

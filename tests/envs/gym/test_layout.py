@@ -58,15 +58,6 @@ def test_a_vector_stays_one() -> None:
     assert layout.unflatten(np.array([1.0, 0.0, 1.0])).dtype == np.int8
 
 
-@pytest.mark.parametrize("shape", [(2, 3), ()])
-def test_a_matrix_and_a_number_become_a_row_and_are_given_back(shape: tuple[int, ...]) -> None:
-    layout = Layout(spaces.Box(-1.0, 1.0, shape, np.float32), "action")
-    values = np.arange(4 * np.prod(shape, dtype=int), dtype=np.float32).reshape(4, *shape)
-    rows = layout.flatten(values)
-    assert rows.shape == (4, layout.width)
-    assert np.array_equal(layout.unflatten(rows), values)
-
-
 def test_whole_numbers_are_rounded() -> None:
     whole = Layout(spaces.Box(-9, 9, (4,), np.int32), "action").unflatten(np.array([0.4, 0.6, 2.999, -1.7]))
     assert (whole.tolist(), whole.dtype) == ([0, 1, 3, -2], np.int32)

@@ -13,7 +13,7 @@ from torchrl_her_envs import TASKS, base_env, make_env
 
 
 @pytest.mark.parametrize("name", TASKS)
-@pytest.mark.parametrize("num_envs", [1, 3])
+@pytest.mark.parametrize("num_envs", [1, 64])  # stepped as numbers, and as arrays
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_specs(name: str, num_envs: int, dtype: torch.dtype) -> None:
     env = make_env(name, num_envs=num_envs, dtype=dtype)
@@ -33,11 +33,6 @@ def test_types_that_numpy_lacks() -> None:
     assert after["reward"].dtype == torch.bfloat16
     assert torch.equal(after["reward"], env.compute_reward(*goals))
     assert torch.equal(after["terminated"], env.compute_terminated(*goals))
-
-
-@pytest.mark.parametrize("name", ["hand_v1", "hand_wall_v2", "robot_v2"])
-def test_specs_of_many_environments(name: str) -> None:
-    check_env_specs(make_env(name, num_envs=64), seed=0)
 
 
 @pytest.mark.parametrize("links", [1, 2, 3])

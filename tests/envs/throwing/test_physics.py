@@ -114,25 +114,14 @@ def test_bounces_die_away() -> None:
 # Sliding and resting
 
 
-def test_a_sliding_ball_slows_by_one_meter_a_second_each_second() -> None:
+def test_a_sliding_ball_slows_by_one_meter_a_second_each_second_and_stops() -> None:
     start = points([1.0, RADIUS]), points([2.0, 0.0])
-    for steps, speed in ((1, 1.96), (25, 1.0), (49, 0.04)):
+    for steps, speed in ((1, 1.96), (25, 1.0), (49, 0.04), (60, 0.0)):
         position, velocity = fly(*start, steps=steps)
-        assert_close(velocity, points([speed, 0.0]), atol=1e-9)
+        assert_close(velocity, points([speed, 0.0]), atol=1e-9 if speed else 1e-12)
         assert position[0, 1].item() == pytest.approx(RADIUS, abs=1e-9)
-
-
-def test_a_sliding_ball_stops_where_it_should() -> None:
-    # 200 substeps at 2.00, 1.99, ..., 0.01 m/s make 2.01 m; after that nothing moves any more
-    position, velocity = fly(points([1.0, RADIUS]), points([2.0, 0.0]), steps=60)
+    # 200 substeps at 2.00, 1.99, ..., 0.01 m/s make 2.01 m
     assert_close(position, points([3.01, RADIUS]), atol=1e-9)
-    assert_close(velocity, points([0.0, 0.0]), atol=1e-12)
-
-
-def test_a_ball_at_rest_stays_at_rest() -> None:
-    position, velocity = fly(points([1.0, RADIUS], [5.82, RADIUS]), points([0.0, 0.0], [0.0, 0.0]), steps=50)
-    assert_close(position, points([1.0, RADIUS], [5.82, RADIUS]))
-    assert_close(velocity, torch.zeros(2, 2, dtype=torch.float64))
 
 
 @pytest.mark.parametrize(

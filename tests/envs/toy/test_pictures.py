@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 import torch
-from PIL import Image
 
-from torchrl_her_envs import make_env, record_episodes
+from torchrl_her_envs import make_env
 from torchrl_her_envs.common.rendering.colors import FAILURE, INK, MARGIN, SUCCESS
-from torchrl_her_envs.common.rendering.video import write_video
 
 
 def color(picture: torch.Tensor, x: float, y: float) -> tuple[int, ...]:
@@ -59,19 +55,6 @@ def test_the_links_of_a_chain_are_filled_when_they_are_closed() -> None:
     bar = long.render(0, size=300)
     assert color(bar, 0.45, 0.5) == INK
     assert color(bar, 0.55, 0.5) == (252, 251, 248)
-
-
-@pytest.mark.parametrize("name", ["bit_flip", "treasure_hunt", "chain"])
-@pytest.mark.parametrize("suffix", [".gif", ".mp4"])
-def test_films_of_each_of_them(name: str, suffix: str, tmp_path: Path) -> None:
-    env = make_env(name, num_envs=2, seed=0, max_steps=4)
-    frames = record_episodes(env, env.rand_action, size=50, hold=1)
-    assert frames[0].shape == (30, 100, 3)
-    film = write_video(frames, tmp_path / f"film{suffix}")
-    assert film.stat().st_size > 300
-    if suffix == ".gif":
-        with Image.open(film) as read:
-            assert read.size == (100, 30)
 
 
 def test_wrong_sizes_and_captions() -> None:

@@ -98,7 +98,8 @@ def test_a_preset_of_ddpg_serves_tasks_whose_actions_are_discrete(task: str) -> 
 @pytest.mark.parametrize("algo", ALGORITHMS)
 @pytest.mark.parametrize("sampler", ["prioritized", "uniform"])
 def test_every_algorithm_runs_with_every_sampler(algo: str, sampler: str) -> None:
-    components = build(small(algo=algo, sampler=sampler, epochs=1))
+    short = {"epochs": 1, "num_envs": 4, "epoch_frames": 240, "warmup_frames": 160}
+    components = build(small(algo=algo, sampler=sampler, **short))
     (row,) = run(components, progress=False).rows
     kind = RunsPrioritizedSampler if sampler == "prioritized" else RunsSampler
     assert type(components.buffer.sampler) is kind

@@ -48,14 +48,12 @@ IDLE: list[tuple[dict[str, Any], dict[str, Any]]] = [
 
 
 @pytest.mark.parametrize(("options", "idle"), IDLE)
-def test_what_has_no_effect_is_refused_by_name(options: dict[str, Any], idle: dict[str, Any]) -> None:
+def test_what_has_no_effect_is_refused_by_name_and_dropped_from_a_preset(
+    options: dict[str, Any], idle: dict[str, Any]
+) -> None:
     (name,) = idle
     with pytest.raises(ValueError, match=f"^{name}=.* has no effect with .*: leave it out"):
         make_recipe(**options, **idle)
-
-
-@pytest.mark.parametrize(("options", "idle"), IDLE)
-def test_what_has_no_effect_is_dropped_from_a_preset(options: dict[str, Any], idle: dict[str, Any]) -> None:
     assert make_recipe(idle, **options) == make_recipe(**options)
 
 

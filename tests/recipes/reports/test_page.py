@@ -140,10 +140,10 @@ def test_pictures_and_curves_are_files_too(unfinished: Path) -> None:
 
 
 def test_bad_input_is_one_clear_line(tmp_path: Path, refused: Refused) -> None:
-    empty = str(tmp_path)
+    empty, none = str(tmp_path), str(tmp_path / "none")
     for arguments, message in {
         ("nothing",): "there is no study 'nothing'; the studies are bias, ",
-        ("bias", "--folder", f"{empty}/none"): "none; `torchrl-her study bias` makes its runs",
+        ("bias", "--folder", none): f"there is no folder {none}; `torchrl-her study bias` makes its runs",
         ("window", "--folder", empty): f"{empty} has no run of the study window; its runs are window=1, ",
     }.items():
         assert message in refused("report", *arguments)

@@ -12,7 +12,7 @@ import torch
 import yaml
 from PIL import Image
 
-from torchrl_her_recipes import Components, Recipe, build, load_policy, play, resume, run
+from torchrl_her_recipes import Components, Recipe, build, load_policy, resume, run
 
 from ..small import assert_same, small
 
@@ -58,13 +58,6 @@ def test_pictures_that_are_not_wanted_are_not_made_until_they_are(tmp_path: Path
     resume(tmp_path, options={"pictures": True}, progress=False)
     pictures = sorted(path.name for path in (*tmp_path.glob("*.png"), *tmp_path.glob("*.gif")))
     assert pictures == ["curves.png", "policy.gif", "virtual_goals.png"]
-
-
-def test_play_shows_the_policy_that_the_run_ended_with(finished: Path, tmp_path: Path) -> None:
-    ((achieved, goals),) = play(finished, out=tmp_path / "play.gif", goals=2, size=64)
-    assert 0 <= achieved <= goals == 2
-    with Image.open(tmp_path / "play.gif") as film:
-        assert film.n_frames > 10
 
 
 def test_a_folder_that_holds_a_run_is_not_written_over(finished: Path) -> None:
