@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 _STEPS = 1 << 22  # opcodes of a pickle: to check them takes a few hundred megabytes at most
 _DEPTH = 100
-_REPEATED = 1 << 24  # greatest surplus of the tensors' numbers over the stored ones (expanded views)
+_REPEATED = 1 << 24  # most elements that tensors may have beyond their storages, as expanded views do
 # The last bytes of an archive of torch.save. They give the size and the place of the directory, and the place
 # of what follows it. Other readers of archives disagree on where the directory is if these do not fit.
 _END = struct.Struct("<4s36xQQ4s4xQ4x4s16xH")
@@ -175,7 +175,7 @@ def _check_description(description: bytes) -> None:
 
 
 def _check_tree(loaded: Any) -> None:
-    """Refuses values that are not plain data, and tensors that are far larger than their stored numbers."""
+    """Refuses values that are not plain data, and tensors that are far larger than their storages."""
     repeated = 0
     for count, value in enumerate(_values(loaded)):
         if type(value) in (Tensor, nn.Parameter):
@@ -186,7 +186,7 @@ def _check_tree(loaded: Any) -> None:
         if count > _STEPS:
             raise _RefusedError(f"it has more than {_STEPS:,} entries")
         if repeated > _REPEATED:
-            raise _RefusedError(f"a tensor of shape {list(value.shape)} is larger than its stored numbers")
+            raise _RefusedError(f"a tensor of shape {list(value.shape)} is larger than its storage")
 
 
 def _values(value: Any, depth: int = 0) -> Iterator[Any]:

@@ -142,7 +142,7 @@ def _scale(sigma: Numbers, samples: Tensor) -> Tensor:
     scale = torch.as_tensor(sigma, dtype=torch.float64).to(samples.device).reshape(-1)
     g = samples.shape[1]
     if len(scale) not in (1, g) or not bool(((scale > 0) & scale.isfinite()).all()):
-        raise ValueError(f"sigma must be positive and finite, one number or {g}, got {sigma}")
+        raise ValueError(f"sigma must be positive and finite, a scalar or of length {g}, got {sigma}")
     return scale.expand(g)
 
 

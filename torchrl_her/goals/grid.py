@@ -173,7 +173,7 @@ def _log_mass(x: Tensor, low: float, high: float, sigma: float) -> Tensor:
 def _sigmas(grid: GoalGrid, sigma: Numbers, label: str = "") -> list[float]:
     sigmas, d = _floats(sigma), len(grid.shape)
     if len(sigmas) not in (1, d) or not all(0 < s < math.inf for s in sigmas):
-        raise ValueError(f"{label}sigma must be positive and finite, one number or {d}, got {sigma}")
+        raise ValueError(f"{label}sigma must be positive and finite, a scalar or of length {d}, got {sigma}")
     # Beyond these bounds q* is one cell, or uniform, whatever sigma is, and squares would overflow.
     dimensions = zip(sigmas * d if len(sigmas) == 1 else sigmas, grid.cell_size, grid.shape, strict=True)
     return [min(max(s, 1e-12 * size), 1e12 * size * n) for s, size, n in dimensions]

@@ -83,7 +83,7 @@ class KernelInstructiveness(InstructiveWeights):
         g = goals.shape[1]
         factor = torch.as_tensor(scale, dtype=torch.float64).reshape(-1)
         if len(factor) not in (1, g) or not bool(((factor > 0) & factor.isfinite()).all()):
-            raise ValueError(f"scale must be positive and finite, one number or {g}, got {scale}")
+            raise ValueError(f"scale must be positive and finite, a scalar or of length {g}, got {scale}")
         self.samples, self.log_target = samples, log_target
         self._scale = factor.to(goals.device).expand(g)
         self._real = goals.detach()[spread_evenly(len(goals), samples, goals.device)].double()

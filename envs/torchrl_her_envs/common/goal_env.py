@@ -25,8 +25,8 @@ _HAIR = 1e-6  # width of the bounds of a fixed action, relative to its value
 class GoalEnv(EnvBase):
     """Base class of TorchRL environments with goals, N of them in one batch.
 
-    Subclasses set ``max_steps`` and the specs, and say how goals are rewarded and how environments are
-    seeded. All other members have defaults to override.
+    Subclasses set ``max_steps`` and the specs, and implement rewards, termination and seeding. All other
+    members have defaults to override.
 
     Attributes:
         max_steps: length of the longest episode.
@@ -41,11 +41,11 @@ class GoalEnv(EnvBase):
 
     @abstractmethod
     def compute_reward(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
-        """Returns the reward of goals: [..., g] to [..., 1]."""
+        """Returns the rewards [..., 1] of pairs of achieved and desired goals [..., g]."""
 
     @abstractmethod
     def compute_terminated(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
-        """Returns whether goals [..., g] end an episode, [..., 1] of bool."""
+        """Returns whether an episode terminates, as bool [..., 1], for pairs of goals [..., g]."""
 
     @abstractmethod
     def set_seeds(self, seeds: Sequence[int]) -> None:
@@ -68,7 +68,7 @@ class GoalEnv(EnvBase):
     def goal_sigma(self) -> float:
         """The final sigma of IBS, as a share of the width of the goals' box.
 
-        It says how near to one of the task's goals another goal has to be to help in learning it.
+        Goals within about this distance of one of the task's goals help in learning it.
         """
         return 0.2
 

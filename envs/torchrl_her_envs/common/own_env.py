@@ -317,7 +317,7 @@ class OwnGoalEnv(GoalEnv):
     def compute_terminated(
         self, achieved_goal: Tensor, desired_goal: Tensor, info: TensorDictBase | None = None
     ) -> Tensor:
-        """Returns whether an episode ends at these goals, [..., 1] of bool."""
+        """Returns whether an episode terminates, as bool [..., 1], for pairs of goals [..., g]."""
         if self.ends == "own":
             return self._ask("compute_terminated", achieved_goal, desired_goal, info).bool()
         return self._meets(achieved_goal, desired_goal, info) & (self.ends in ("success", "reward"))
@@ -479,11 +479,12 @@ class OwnGoalEnv(GoalEnv):
     def _check(self, env: EnvBase) -> None:
         """Raises a ValueError that names what the environment lacks."""
         shown = env.full_observation_spec
+        known = ", ".join(map(str, shown))
         for key in [name for role in KEYS for name in self._entries(role)]:
             if key not in shown:
-                raise ValueError(f"{self._name} lacks {key!r} in what it shows: {', '.join(map(str, shown))}")
+                raise ValueError(f"{self._name}'s observations must have {key!r}, got {known}")
             if len(shown[key].shape) != 1 + self._whole:
-                raise ValueError(f"{self._name} must show {key!r} as a vector, got {list(shown[key].shape)}")
+                raise ValueError(f"{self._name}'s {key!r} must be a vector, got {list(shown[key].shape)}")
         achieved, desired = ([list(shown[name].shape) for name in self._entries(key)] for key in _GOALS)
         if achieved != desired:
             raise ValueError(
@@ -492,12 +493,10 @@ class OwnGoalEnv(GoalEnv):
             )
         for name in self._info:
             if name not in shown:
-                known = ", ".join(map(str, shown))
-                raise ValueError(f"{self._name}: info_keys names {name!r}, which is not shown: {known}")
+                raise ValueError(f"{self._name}'s info_keys must be among {known}, got {name!r}")
         if not callable(getattr(env, "compute_reward", None)):
             raise ValueError(
-                f"{self._name} lacks the method 'compute_reward', which tells what other goals would have "
-                "given"
+                f"{self._name} lacks the method 'compute_reward', which computes the rewards of other goals"
             )
         if list(env.action_keys) != ["action"] or list(env.reward_keys) != ["reward"]:
             raise ValueError(

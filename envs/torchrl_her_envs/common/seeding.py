@@ -80,7 +80,7 @@ def as_seeds(seed: int | Sequence[int]) -> list[int]:
     try:
         return [operator.index(value) for value in seed]
     except TypeError:
-        raise TypeError(f"a seed must be an integer, or several, got {seed!r}") from None
+        raise TypeError(f"seed must be an integer or a sequence of integers, got {seed!r}") from None
 
 
 @overload

@@ -126,7 +126,7 @@ def check_goal_env(id: str, env: gymnasium.Env) -> None:
     """Raises a ValueError that names what an environment lacks of GoalEnv or of what training needs."""
     _check_shown(id, env.observation_space)
     if not env.has_wrapper_attr(REWARD):
-        raise ValueError(f"{id} lacks the method {REWARD!r}, which tells what other goals would have given")
+        raise ValueError(f"{id} lacks the method {REWARD!r}, which computes the rewards of other goals")
     if not isinstance(env.action_space, spaces.Box | spaces.Discrete):
         raise ValueError(f"{id}'s actions must be a Box or Discrete, got {env.action_space}")
     if isinstance(env.action_space, spaces.Box) and not env.action_space.is_bounded():
@@ -135,12 +135,13 @@ def check_goal_env(id: str, env: gymnasium.Env) -> None:
 
 def _check_shown(id: str, space: spaces.Space) -> None:
     if not isinstance(space, spaces.Dict):
-        raise ValueError(f"{id} shows no dict of {', '.join(KEYS)}, but a {type(space).__name__}")
+        got = type(space).__name__
+        raise ValueError(f"{id}'s observations must be a dict of {', '.join(KEYS)}, got a {got}")
     for key in KEYS:
         if key not in space.spaces:
-            raise ValueError(f"{id} lacks {key!r} in what it shows: {', '.join(space.spaces)}")
-    achieved, desired = (Layout(space[key], f"{id} must show {key!r}").shapes for key in KEYS[1:])
-    Layout(space[KEYS[0]], f"{id} must show {KEYS[0]!r}")
+            raise ValueError(f"{id}'s observations must have {key!r}, got {', '.join(space.spaces)}")
+    achieved, desired = (Layout(space[key], f"{id}'s {key!r}").shapes for key in KEYS[1:])
+    Layout(space[KEYS[0]], f"{id}'s {KEYS[0]!r}")
     if achieved != desired:
         one, other = (space[key] if achieved[0][0] else space[key].shape for key in KEYS[1:])
         raise ValueError(f"{id}'s achieved and desired goals must have one shape, got {one} and {other}")

@@ -193,7 +193,8 @@ class GymGoalEnv(GoalEnv, GymWrapper):
         termination: rule that ends an episode at its goal.
         achieved_reward: the reward from which on a goal counts as achieved; the reward of equal goals if
             None.
-        info_keys: keys of ``info`` that its functions read: numbers, or arrays of numbers, in every step.
+        info_keys: keys of ``info`` that its functions read. The info of every step must have them, as numbers
+            or arrays of numbers.
 
     Attributes:
         goal_ends: what ends an episode at its goal, and what the environment was seen to do there.
@@ -350,7 +351,7 @@ class GymGoalEnv(GoalEnv, GymWrapper):
     def compute_terminated(
         self, achieved_goal: Tensor, desired_goal: Tensor, info: TensorDictBase | None = None
     ) -> Tensor:
-        """Returns whether an episode ends at these goals, [..., 1] of bool."""
+        """Returns whether an episode terminates, as bool [..., 1], for pairs of goals [..., g]."""
         if self.ends == "own":
             return self._ask(self._terminated_of, achieved_goal, desired_goal, info).bool()
         reward = self.compute_reward(achieved_goal, desired_goal, info)

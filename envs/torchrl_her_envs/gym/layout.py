@@ -127,5 +127,5 @@ def _leaves(space: spaces.Space, path: tuple[str, ...], name: str) -> list[_Leaf
         return [leaf for key, part in parts for leaf in _leaves(part, (*path, key), name)]
     if space.shape is None or space.dtype is None or space.dtype.kind not in "fiub":
         where = f" in {'.'.join(path)}" if path else ""
-        raise ValueError(f"{name} as numbers or a dictionary of arrays, got {space}{where}")
+        raise ValueError(f"{name} must be numbers or a dictionary of arrays, got {space}{where}")
     return [_Leaf(path, space.shape, np.dtype(space.dtype))]

@@ -36,7 +36,8 @@ class RenamedKeys(gymnasium.ObservationWrapper):
                 if name not in known:
                     env.close()
                     id = env.spec.id if env.spec else type(env).__name__
-                    raise ValueError(f"{id} lacks {name!r} in what it shows: {', '.join(known) or 'no dict'}")
+                    got = ", ".join(known) or "no dict"
+                    raise ValueError(f"{id}'s observations must have {name!r}, got {got}")
         entries = self.observation(env.observation_space)
         inner = {
             key: spaces.Dict(entry) if isinstance(entry, dict) else entry for key, entry in entries.items()

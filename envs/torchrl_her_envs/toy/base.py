@@ -104,7 +104,7 @@ class ToyEnv(BatchedEnv):
         )
         self.set_seeds(as_seeds(seed))
 
-    # What the task is
+    # The task
 
     @property
     def task_name(self) -> str:
@@ -116,7 +116,7 @@ class ToyEnv(BatchedEnv):
         return self._goals
 
     def compute_terminated(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
-        """Returns whether achieved and desired goals [..., g] are equal, [..., 1] of bool.
+        """Returns whether achieved and desired goals [..., g] are equal, as bool [..., 1].
 
         Raises:
             ValueError: goals of another width than g.
@@ -138,7 +138,7 @@ class ToyEnv(BatchedEnv):
         """Returns pictures three fifths as high as they are wide."""
         return [draw(WIDTH if size is None else size, partial(self._draw, world=world)) for world in worlds]
 
-    # What each toy environment says
+    # Methods that subclasses implement or override
 
     @abstractmethod
     def _draw(self, sheet: Sheet, world: int) -> None:

@@ -113,26 +113,26 @@ def check_order(
     """Refuses options that cannot be used if each episode has a stage of its own.
 
     Raises:
-        ValueError: The weights count goals of all stages as one; or processes collect, each of which would
-            need the results of the others' episodes; or there are demonstrations, which are relabeled for
-            one stage of a run.
+        ValueError: The weights would count goals of different stages together; processes collect, and
+            each would need the results of the others' episodes; or there are demonstrations, which are
+            relabeled for one stage of a run.
     """
     if not isinstance(progress, EpisodeStages):
         return
     if not isinstance(weights, Equal):
         raise ValueError(
-            f"weights={weights.name} must not be used with order={order.name}: they would take the "
-            "goals of all stages for one kind; choose order=threshold"
+            f"weights={weights.name} cannot be used with order={order.name}: goals of different "
+            "stages would be counted together; choose order=threshold"
         )
     if progress.adapts and processes > 0:
         raise ValueError(
-            f"order={order.name} draws stages by how all episodes have ended: it needs processes=0, "
+            f"order={order.name} draws stages by the results of all episodes: it needs processes=0, "
             f"got processes={processes}"
         )
     if demonstrations > 0:
         raise ValueError(
-            f"demonstrations are shown in a run's stage, and with order={order.name} "
-            "it has none: choose order=threshold"
+            f"demonstrations cannot be used with order={order.name}: they are relabeled for "
+            "one stage of a run, but each episode has a stage of its own; choose order=threshold"
         )
 
 

@@ -16,8 +16,9 @@ from torchrl_her_recipes.config.without_effect import without_effect
 TERMINATION = "termination"  # option of a task: the rule that ends an episode at its goal
 _WARMUP = 1_000  # least number of environment steps before learning
 _EPISODES = 100  # number in an epoch if environments are stepped one by one
-_AT_ONCE = {"order": "all_at_once", "every_stage": True, "task_share": 1.0}  # order of a found curriculum
-_STAGE_EPOCHS = 10  # in the first stage of a found curriculum, at most, if goals are weighted
+# Options of the curriculum that algo=auto chooses: all stages at once, or in sequence if goals are weighted
+_AT_ONCE = {"order": "all_at_once", "every_stage": True, "task_share": 1.0}
+_STAGE_EPOCHS = 10  # most epochs of a stage below the last
 
 
 @dataclass(frozen=True, kw_only=True)

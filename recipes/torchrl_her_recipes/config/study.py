@@ -244,7 +244,7 @@ def load_study(
         if strange := next((name for name in named if name not in combined), None):
             labels = ", ".join(combined)
             raise ValueError(f"expect must name combinations, which are {labels}; got {strange!r}")
-    if name in study_names():  # this package's own files may name modules
+    if name in study_names():  # only the package's own studies may have modules of tasks imported
         for _, recipe in cells:
             permit_task(recipe.task.name)
     return study

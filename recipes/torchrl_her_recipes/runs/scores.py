@@ -89,7 +89,7 @@ class BestPolicy:
         self.is_new = False
 
     def state_dict(self) -> dict[str, Any] | None:
-        """Returns ``state``."""
+        """Returns the best policy's weights, epoch and success; None before the first evaluation."""
         return self.state
 
     def load_state_dict(self, state: dict[str, Any] | None) -> None:

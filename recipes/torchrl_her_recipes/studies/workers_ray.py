@@ -98,7 +98,7 @@ class RayWorkers:
     def progress(self) -> dict[str, Progress]:
         try:
             board = ray.get(self._board.read.remote())
-        except RayError:  # this machine's node is gone; run() raises an error, too
+        except RayError:  # the node of the board is lost, which run() reports as an error
             board = {}
         return {label: board[label] for label in list(self._tasks) if label in board}
 

@@ -106,5 +106,5 @@ def test_seeds_as_a_list() -> None:
 
 @pytest.mark.parametrize("seeds", [1.7, [1.7], [3, 1.0], np.array([1.7]), "7"])
 def test_seeds_that_are_not_integers_are_refused(seeds: Any) -> None:
-    with pytest.raises(TypeError, match="a seed must be an integer, or several, got "):
+    with pytest.raises(TypeError, match="seed must be an integer or a sequence of integers, got "):
         as_seeds(seeds)

@@ -21,11 +21,11 @@ TO_TARGET = spaces.Box(-1.0, 1.0, (2,), np.float64)
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"without": "desired_goal"}, "lacks 'desired_goal' in what it shows: .*achieved_goal, observation"),
+        ({"without": "desired_goal"}, "must have 'desired_goal', got .*achieved_goal, observation"),
         ({"without": "compute_reward"}, "lacks the method 'compute_reward'"),
-        ({"shown": TO_TARGET}, "shows no dict of observation, achieved_goal, desired_goal, but a Box"),
+        ({"shown": TO_TARGET}, "must be a dict of observation, achieved_goal, desired_goal, got a Box"),
         ({"shown": {"desired_goal": TO_TARGET}}, r"must have one shape, got \(1,\) and \(2,\)"),
-        ({"shown": {"achieved_goal": spaces.Text(5)}}, "must show 'achieved_goal' as numbers"),
+        ({"shown": {"achieved_goal": spaces.Text(5)}}, "'s 'achieved_goal' must be numbers"),
         ({"actions": spaces.MultiBinary(2)}, r"must be a Box or Discrete, got MultiBinary\(2\)"),
         ({"actions": spaces.Box(-np.inf, np.inf, (2,))}, "actions must have bounds"),
     ],

@@ -77,14 +77,14 @@ def test_a_number_that_float32_cannot_hold_is_named(value: float, got: str) -> N
 @pytest.mark.parametrize(
     ("space", "message"),
     [
-        (spaces.Text(3), "must show 'x' as numbers or a dictionary of arrays, got Text"),
+        (spaces.Text(3), "'x' must be numbers or a dictionary of arrays, got Text"),
         (spaces.Dict(a=spaces.Dict(b=spaces.Text(3))), "got Text.* in a.b"),
-        (spaces.Dict({}), "must show 'x' has an empty dictionary"),
+        (spaces.Dict({}), "'x' has an empty dictionary"),
     ],
 )
 def test_what_has_no_numbers_is_named(space: spaces.Space, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        Layout(space, "must show 'x'")
+        Layout(space, "'x'")
 
 
 class Crane(gymnasium.Env):

@@ -129,8 +129,8 @@ class Hook(Crane):
 @pytest.mark.parametrize(
     ("names", "message"),
     [
-        ({"desired_goal_key": "hook_at"}, "lacks 'hook_at' in what it shows: sensors, .*"),
-        ({"achieved_goal_key": ["hook", "angel"]}, "lacks 'angel' in what it shows"),
+        ({"desired_goal_key": "hook_at"}, "'s observations must have 'hook_at', got sensors, .*"),
+        ({"achieved_goal_key": ["hook", "angel"]}, "'s observations must have 'angel', got "),
         ({"desired_goal_key": ["hook_to"]}, "'s achieved and desired goals must have one shape"),
     ],
 )

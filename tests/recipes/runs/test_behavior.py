@@ -259,7 +259,7 @@ def test_a_memory_below_what_comes_at_once_is_refused() -> None:
 
 
 def test_weights_that_cannot_tell_stages_apart_are_refused() -> None:
-    with pytest.raises(ValueError, match="weights=rare must not be used with order=all_at_once"):
+    with pytest.raises(ValueError, match="weights=rare cannot be used with order=all_at_once"):
         build(small(task="hand_v1", algo="cher_rare", order="all_at_once"))
 
 

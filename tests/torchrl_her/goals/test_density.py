@@ -135,9 +135,9 @@ def test_densities_are_finite_wherever_points_are(
             random(3, 2),
             random(4, 2),
             {"sigma": 0.0},
-            "sigma must be positive and finite, one number or 2, got 0",
+            "sigma must be positive and finite, a scalar or of length 2, got 0",
         ),
-        (random(3, 2), random(4, 2), {"sigma": [1.0] * 3}, "one number or 2, got .1.0, 1.0, 1.0."),
+        (random(3, 2), random(4, 2), {"sigma": [1.0] * 3}, "a scalar or of length 2, got .1.0, 1.0, 1.0."),
         (random(3, 2), random(4, 2), {"k": 0}, "k must be from 1 to the number of samples, 4, got 0"),
         (random(3, 2), random(4, 2), {"k": 5}, "k must be from 1 to the number of samples, 4, got 5"),
         (

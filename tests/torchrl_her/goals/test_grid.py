@@ -226,7 +226,7 @@ def test_target_is_always_a_distribution(dims: list[tuple[float, ...]], magnitud
 @pytest.mark.parametrize("sigma", [0.0, -0.2, math.nan, math.inf, [0.1, 0.0], [0.1, 0.1, 0.1]])
 def test_bad_sigmas_are_named(sigma: Any) -> None:
     with pytest.raises(
-        ValueError, match="sigma must be positive and finite, one number or 2, got .*[0-9naif]"
+        ValueError, match="sigma must be positive and finite, a scalar or of length 2, got .*[0-9naif]"
     ):
         RIGHT(sigma)
     with pytest.raises(ValueError, match="sigma must be positive and finite"):

@@ -20,7 +20,7 @@ class Rings:
 
     Attributes:
         cursors: R, the places within the blocks where the next rows go.
-        sizes: R, how many rows each block has.
+        sizes: R, the numbers of rows that the blocks hold.
 
     Example:
         >>> rings = Rings(2)
@@ -36,19 +36,20 @@ class Rings:
         self.cursors, self.sizes = [0] * runs, [0] * runs
 
     def moves(self, run: int, *, begin: int, count: int, capacity: int) -> list[Move]:
-        """Returns the slices for a run's next rows, as far as they fit, and advances its cursor.
+        """Returns where a run's new rows are copied to in its block, and advances the run's cursor.
 
         Args:
             run: index of the run.
 
         Keyword Args:
-            begin: position of the first of these rows among all that are to be written.
-            count: number of these rows, which are consecutive. Of more than ``capacity``, only the last
-                ones are moved.
-            capacity: rows of a block.
+            begin: position of the first new row of the run among the new rows of all runs.
+            count: number of new rows of the run, which are consecutive. If there are more than
+                ``capacity``, only the last ``capacity`` rows are copied.
+            capacity: number of rows in a block.
 
         Returns:
-            The slices to copy: one, or two where the block's end is reached, and none for no rows.
+            Pairs of slices, of the new rows and of the storage: one pair, two if the rows continue at the
+            block's start, none without rows.
         """
         end, moves = begin + count, []
         cursor = (self.cursors[run] + max(0, count - capacity)) % capacity

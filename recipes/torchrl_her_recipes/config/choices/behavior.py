@@ -1,4 +1,4 @@
-"""Behavior goals by name: the options of each, whose makers are in :mod:`..components.goals.behavior`."""
+"""Choices of behavior goals, with their options; the makers are in :mod:`..components.goals.behavior`."""
 
 from __future__ import annotations
 

@@ -26,7 +26,9 @@ C = TypeVar("C", bound=Choice)
 
 
 class Kind(dict[str, type[C]]):
-    """The choices for a section by name. ``kind(name="mega", cutoff=-5.0)`` makes the options of a choice.
+    """Registry of the choices for one section of a recipe: their classes by name.
+
+    A call makes an instance: ``kind(name="mega", cutoff=-5.0)`` is the choice ``mega`` with this cutoff.
 
     Args:
         section: Name of the section.
@@ -55,7 +57,7 @@ class Kind(dict[str, type[C]]):
         return choice
 
     def find(self, name: object) -> type[C]:
-        """Returns the choice of a name."""
+        """Returns the class of the choice with this name."""
         if str(name) not in self:
             hint = nearest(name, self) or REGISTERED
             raise ValueError(f"{self.section} must be one of {', '.join(self)}, got {name!r}{hint}")

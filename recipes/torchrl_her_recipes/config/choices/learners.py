@@ -1,4 +1,4 @@
-"""The learners by name; each has its options here and its builder in :mod:`..components.learners`."""
+"""Choices of the learner, with their options; the makers are in :mod:`..components.learners`."""
 
 from __future__ import annotations
 

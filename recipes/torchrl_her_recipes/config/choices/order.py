@@ -1,4 +1,4 @@
-"""Orders of stages by name: the options of each, whose makers are in :mod:`..components.curricula`."""
+"""Choices of the order of stages, with their options; the makers are in :mod:`..components.curricula`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Weights of virtual goals by name: their options; the makers are in :mod:`..components.goals.weights`."""
+"""Choices of goal weights, with their options; the makers are in :mod:`..components.goals.weights`."""
 
 from __future__ import annotations
 

@@ -31,8 +31,12 @@ class WandbRun(WandbLogger):
 def open_wandb(run: RunView, _frames: int) -> tuple[WandbRun, int]:
     """Opens a logger into the project ``WANDB_PROJECT`` or ``torchrl-her``; a resumed run keeps its id.
 
-    A run that is offline (``WANDB_MODE=offline``) logs the whole table again, and replaces earlier files.
-    If it is online, the service cannot delete rows: it keeps the rows that it has, and gets only later ones.
+    If W&B is offline (``WANDB_MODE=offline``), a resumed run logs its whole table of metrics to new files,
+    and earlier files are removed. If W&B is online, rows that it has cannot be deleted, so only later rows
+    are logged.
+
+    Returns:
+        The logger, and the number of frames up to which it already has rows.
     """
     assert run.folder is not None
     home = run.folder.path
