@@ -1,15 +1,17 @@
-"""Goal strategies: which achieved goals of an episode a transition may take, and their registry."""
+"""Goal strategies and sources: which achieved goals a transition may take, and how many from each source."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from difflib import get_close_matches
+from numbers import Integral
 
 import torch
 from torch import Tensor
 
 StrategyFunction = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 Strategy = str | StrategyFunction
+GoalSources = Mapping[Strategy, int]
 
 
 def future(time: Tensor, lengths: Tensor) -> tuple[Tensor, Tensor]:
@@ -30,7 +32,7 @@ def episode(time: Tensor, lengths: Tensor) -> tuple[Tensor, Tensor]:
 STRATEGIES: dict[str, StrategyFunction] = {"future": future, "final": final, "episode": episode}
 _SAFE = tuple(STRATEGIES.values())  # these never leave the episode, so their candidates are not checked
 
-# Sources of goals that are no strategies, as they look beyond the episode: see ``sources``.
+# Sources of goals that are no strategies, as they look beyond the episode: see ``check_goal_sources``.
 RECENT = ("actual", "achieved")
 
 
@@ -139,3 +141,53 @@ def candidate_range(strategy: Strategy, time: Tensor, lengths: Tensor) -> tuple[
                 f"candidates first={low}, end={high}, but 0 <= first < end <= {length} must hold"
             )
     return first, end
+
+
+def check_goal_sources(sources: GoalSources) -> dict[Strategy, int]:
+    """Checks the number of virtual goals that each transition gets from each source.
+
+    A source is a goal strategy, which gives goals of the transition's own episode, or one of two that look
+    beyond it: ``"actual"``, the desired goals of recent episodes, and ``"achieved"``, the goals that were
+    achieved in recent episodes.
+
+    Args:
+        sources: the number of goals, at least 1, of each source.
+
+    Returns:
+        A new dictionary of the same numbers as plain ``int``.
+
+    Raises:
+        ValueError: there is no source, an unknown one, or a number below 1.
+        TypeError: ``sources`` is not a mapping from sources to numbers.
+
+    Example:
+        >>> check_goal_sources({"future": 2, "actual": 2})
+        {'future': 2, 'actual': 2}
+    """
+    if not isinstance(sources, Mapping):
+        raise TypeError(f"goal_sources must be numbers by source, as in {{'future': 4}}, got {sources!r}")
+    if not sources:
+        raise ValueError("goal_sources needs at least one source, as in {'future': 4}; k=0 asks for no goals")
+    checked: dict[Strategy, int] = {}
+    for source, number in sources.items():
+        if not callable(source) and source not in (known := [*STRATEGIES, *RECENT]):
+            nearest = get_close_matches(str(source), known, n=1)
+            hint = f"; did you mean {nearest[0]!r}?" if nearest else ""
+            raise ValueError(f"unknown goal source {source!r}; the sources are {', '.join(known)}{hint}")
+        if not isinstance(number, Integral) or isinstance(number, bool) or number < 1:
+            raise ValueError(
+                f"goal_sources must give whole numbers of at least 1, got {number!r} for "
+                f"{strategy_name(source)!r}"
+            )
+        checked[source] = int(number)
+    return checked
+
+
+def sources_name(sources: GoalSources) -> str:
+    """Returns the name of goal sources for a report.
+
+    Example:
+        >>> sources_name({"future": 2, "actual": 2})
+        'future: 2, actual: 2'
+    """
+    return ", ".join(f"{strategy_name(source)}: {number}" for source, number in sources.items())

@@ -17,7 +17,7 @@ from torchrl_her.goals.weights import GoalWeights, WeightsOfRuns
 from torchrl_her.randomness import Generators, RunDraws
 from torchrl_her.replay_buffers.episodes import Episodes
 from torchrl_her.replay_buffers.options import Per
-from torchrl_her.replay_buffers.runs.chunk import Chunk
+from torchrl_her.replay_buffers.runs.pieces import Chunk
 from torchrl_her.replay_buffers.runs.recent import RecentGoals
 
 Keep = Callable[[Any, Tensor], Tensor]

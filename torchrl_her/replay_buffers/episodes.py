@@ -20,15 +20,17 @@ class Episodes:
     rows: Tensor
     lengths: Tensor
 
+    @classmethod
+    def consecutive(cls, first: Tensor, lengths: Tensor) -> Episodes:
+        """Returns episodes [E] whose rows follow each other, from the positions ``first`` on."""
+        horizon = int(lengths.max()) if len(lengths) else 0
+        step = torch.arange(horizon, device=first.device).minimum(lengths.unsqueeze(-1) - 1)
+        return cls(first.unsqueeze(-1) + step, lengths)
+
     @property
     def inside(self) -> Tensor:
         """Mask of the entries that are not padding, [E, T] of bool."""
         return torch.arange(self.rows.shape[1], device=self.rows.device) < self.lengths.unsqueeze(-1)
-
-    def split(self, size: int) -> list[Episodes]:
-        """Splits the episodes, in order, into parts of at most ``size``."""
-        starts = range(0, len(self.lengths), size)
-        return [Episodes(self.rows[i : i + size], self.lengths[i : i + size]) for i in starts]
 
 
 def time_order(streams: Tensor) -> Tensor:
@@ -71,10 +73,37 @@ def find_episodes(streams: Tensor, end: Tensor, order: Tensor | None = None) -> 
     length = torch.diff(first, append=first.new_tensor([len(streams)]))
     whole = end[first + length - 1]
     left = order[~whole.repeat_interleave(length)].sort().values
-    return _pad(order, first[whole], length[whole]), left
+    episodes = Episodes.consecutive(first[whole], length[whole])
+    return Episodes(order[episodes.rows], episodes.lengths), left
 
 
-def _pad(order: Tensor, first: Tensor, length: Tensor) -> Episodes:
-    horizon = int(length.max()) if len(length) else 0
-    step = torch.arange(horizon, device=order.device).minimum(length.unsqueeze(-1) - 1)
-    return Episodes(order[first.unsqueeze(-1) + step], length)
+def slice_positions(
+    place: Tensor, episode: Tensor, ends: Tensor | None = None, inside: Tensor | None = None
+) -> Tensor:
+    """Groups the transitions of a batch that was sampled as sequences by slice.
+
+    Args:
+        place: [B] int64, places in :class:`~torchrl_her.replay_buffers.EpisodeIndex`; the places of a slice
+            follow each other.
+        episode: [B] int64, a number that differs between episodes.
+        ends: [B, 1] of bool, the last transitions of slices. Without them, slices that happen to follow each
+            other are one.
+        inside: [B] of bool, False where a slice was padded with its last transition; None for no padding.
+
+    Returns:
+        [S, L] int64, positions in the batch; short slices repeat their last transition.
+
+    Example:
+        >>> place = torch.tensor([4, 5, 6, 8, 9])
+        >>> slice_positions(place, torch.zeros(5)).tolist()
+        [[0, 1, 2], [3, 4, 4]]
+    """
+    begins = torch.ones_like(place, dtype=torch.bool)
+    begins[1:] = (place[1:] != place[:-1] + 1) | (episode[1:] != episode[:-1])
+    if ends is not None:
+        begins[1:] |= ends.flatten()[:-1]
+    if inside is not None:
+        begins &= inside.flatten()
+    first = begins.nonzero().squeeze(-1)
+    length = torch.diff(first, append=first.new_tensor([len(place)]))
+    return Episodes.consecutive(first, length).rows

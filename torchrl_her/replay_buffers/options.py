@@ -15,8 +15,14 @@ from torch import Tensor
 from torchrl_her.checks import check_whole
 from torchrl_her.env_keys import EnvKeys
 from torchrl_her.goals.rewards import RewardFunction
-from torchrl_her.goals.sources import GoalSources, check_goal_sources, sources_name
-from torchrl_her.goals.strategies import RECENT, Strategy, get_strategy
+from torchrl_her.goals.strategies import (
+    RECENT,
+    GoalSources,
+    Strategy,
+    check_goal_sources,
+    get_strategy,
+    sources_name,
+)
 from torchrl_her.goals.weights import GoalWeights
 from torchrl_her.replay_buffers.keys import LEAST_COST, TransitionKeys, in_root_and_next, under_next
 

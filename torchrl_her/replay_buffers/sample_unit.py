@@ -36,6 +36,7 @@ from torchrl_her.goals.strategies import RECENT, Strategy, candidate_range
 from torchrl_her.goals.weights import GoalWeights, checked_weights
 from torchrl_her.randomness import RunDraws
 from torchrl_her.replay_buffers.episode_index import EpisodeIndex, index_episodes
+from torchrl_her.replay_buffers.episodes import slice_positions
 from torchrl_her.replay_buffers.keys import device_of, failures, stored_as
 from torchrl_her.replay_buffers.n_steps import STEPS_KEY, NStepReturn, n_step_return, windows
 from torchrl_her.replay_buffers.neighbors import (
@@ -49,7 +50,6 @@ from torchrl_her.replay_buffers.neighbors import (
     refuse_unordered,
 )
 from torchrl_her.replay_buffers.options import HindsightBase, HindsightOptions
-from torchrl_her.replay_buffers.slices import slice_positions
 from torchrl_her.torchrl_private import (
     buffers_of,
     functions_on_batches,

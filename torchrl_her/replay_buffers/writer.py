@@ -25,19 +25,12 @@ from torchrl_her.replay_buffers.keys import device_of, in_root_and_next
 from torchrl_her.replay_buffers.neighbors import SHARED, refuse_beside_writer, refuse_stages
 from torchrl_her.replay_buffers.options import HindsightBase, HindsightOptions
 from torchrl_her.replay_buffers.runs.batches import Batch
-from torchrl_her.replay_buffers.runs.chunk import Chunk
-from torchrl_her.replay_buffers.runs.counts import (
-    RunCounts,
-    WriterCounts,
-    real_positives,
-    virtual_positives,
-)
-from torchrl_her.replay_buffers.runs.pieces import split_runs
+from torchrl_her.replay_buffers.runs.counts import RunCounts, WriterCounts, count_rows
+from torchrl_her.replay_buffers.runs.pieces import Chunk, split_runs
 from torchrl_her.replay_buffers.runs.recent import RecentGoals
 from torchrl_her.replay_buffers.runs.rings import Places, Rings
-from torchrl_her.replay_buffers.runs.rows import join_rows
 from torchrl_her.replay_buffers.runs.storage import PackedStorage, write_slices
-from torchrl_her.replay_buffers.runs.written import WrittenRows, real_rows, virtual_rows
+from torchrl_her.replay_buffers.runs.written import WrittenRows, join_rows, real_rows, virtual_rows
 from torchrl_her.replay_buffers.stage_rules import StageRule, check_stages, split_stages
 from torchrl_her.replay_buffers.streams import broken, ends_of_held
 
@@ -54,16 +47,14 @@ class _Draft(NamedTuple):
     runs: list[int]
     real: WrittenRows
     virtual: WrittenRows | None
-    numbers: dict[str, list[int]]  # arguments of RunCounts.add
+    numbers: list[WriterCounts]  # of each run
     weighted: bool  # whether weights are updated with the virtual goals
     ids: int  # number of trajectory ids that the episodes take
 
     @property
     def counts(self) -> list[int]:
         """Number of transitions of each run, real and virtual."""
-        if self.virtual is None:
-            return self.real.counts
-        return [sum(both) for both in zip(self.real.counts, self.virtual.counts, strict=True)]
+        return [counts.real + counts.virtual for counts in self.numbers]
 
 
 class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
@@ -470,7 +461,7 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
 
     def _draft(self, chunk: Chunk, recent: RecentGoals, *, weighted: bool, first_id: int) -> _Draft:
         """Returns the transitions of some episodes. Nothing is written or counted yet."""
-        runs, virtual = chunk.piece.runs, None
+        runs = chunk.piece.runs
         weights = self.goal_weights if weighted else []
         drawn = draw_for_runs(
             chunk,
@@ -481,10 +472,8 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
         )
         copies = len(drawn.source)
         real = real_rows(chunk, first_id=first_id + copies)
-        numbers = {"real": real.counts, "relabeled": drawn.relabeled, **real_positives(chunk, real)}
-        if copies > 0:
-            virtual = virtual_rows(chunk, drawn.source, drawn.goals, first_id=first_id)
-            numbers |= {"virtual": virtual.counts, **virtual_positives(chunk, virtual)}
+        virtual = virtual_rows(chunk, drawn.source, drawn.goals, first_id=first_id) if copies else None
+        numbers = count_rows(chunk, real, virtual, drawn.relabeled)
         ids = copies + len(chunk.episodes.lengths) if self.options.per == "episode" else 0
         return _Draft(chunk.rows, runs, real, virtual, numbers, weighted=weighted, ids=ids)
 
@@ -514,7 +503,7 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
             for place, draft in enumerate(drafts):
                 # Not all at once unless ``on_write`` needs them: that would touch fresh memory.
                 self._store(joined[place] if joined else join(draft), draft.runs, draft.counts)
-                self._counts.add(draft.runs, **draft.numbers)
+                self._counts.add(draft.runs, draft.numbers)
                 places.note(draft.runs, draft.real.root.split(draft.real.counts), draft.counts)
         except Exception:
             for back in reversed(undo):

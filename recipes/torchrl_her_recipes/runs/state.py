@@ -11,8 +11,7 @@ import torch
 from torchrl.envs import EnvBase
 
 from torchrl_her.curriculum.switch import set_stage_goals
-from torchrl_her.goals.sources import sources_name
-from torchrl_her.goals.strategies import strategy_name
+from torchrl_her.goals.strategies import sources_name, strategy_name
 from torchrl_her.modules.noise import generator_states, set_generator_states
 from torchrl_her.replay_buffers.writer import HERWriter
 from torchrl_her.trainers.checkpoint import (

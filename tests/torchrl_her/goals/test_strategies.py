@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchrl_her import register_strategy
 from torchrl_her.goals import STRATEGIES, candidate_range, candidates, get_strategy, strategy_name
+from torchrl_her.goals.strategies import check_goal_sources, sources_name
 
 
 def test_an_unknown_strategy_is_named_with_those_that_there_are() -> None:
@@ -87,3 +88,18 @@ def test_a_strategy_that_leaves_the_episode_is_named(shift: tuple[int, int], mes
 
     with pytest.raises(ValueError, match=f"goal strategy 'astray' gives .*{message}"):
         candidate_range(astray, torch.arange(3), torch.tensor(3))
+
+
+def test_functions_are_sources_too() -> None:
+    given = {at_most_two_steps: 2, "achieved": 1, "final": 1}
+    sources = check_goal_sources(given)
+    assert sources == given
+    assert sources_name(sources) == "at_most_two_steps: 2, achieved: 1, final: 1"
+
+
+def test_numbers_are_made_plain_and_the_mapping_is_a_copy() -> None:
+    given = {"future": torch.ones(3, dtype=torch.int64).numpy().sum()}
+    checked = check_goal_sources(given)
+    assert type(checked["future"]) is int
+    given["future"] = 9
+    assert checked == {"future": 3}

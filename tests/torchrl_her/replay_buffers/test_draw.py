@@ -11,8 +11,7 @@ from torchrl_her import GoalReward, GoalWeights, HindsightOptions
 from torchrl_her.goals.weights import WeightsOfRuns
 from torchrl_her.replay_buffers import Episodes, draw_goals
 from torchrl_her.replay_buffers.draw import draw_for_runs
-from torchrl_her.replay_buffers.runs.chunk import Chunk
-from torchrl_her.replay_buffers.runs.pieces import Piece
+from torchrl_her.replay_buffers.runs.pieces import Chunk, Piece
 from torchrl_her.replay_buffers.runs.recent import RecentGoals
 
 WALK = torch.arange(6.0).unsqueeze(-1)  # two episodes: 0 to 3 and 3 to 5; then they have 3 and 2 steps

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from torchrl_her.replay_buffers import find_episodes
 from torchrl_her.replay_buffers.episodes import time_order
+from torchrl_her.replay_buffers.runs.pieces import split_runs
 
 
 def test_episodes_of_different_lengths_are_padded_with_their_last_row() -> None:
@@ -35,7 +36,6 @@ def test_interleaved_lanes_are_told_apart() -> None:
 def test_nothing_closed_is_no_episode() -> None:
     episodes, left = find_episodes(torch.tensor([0, 0]), torch.tensor([False, False]))
     assert len(episodes.lengths) == 0
-    assert episodes.split(3) == []
     assert left.tolist() == [0, 1]
 
 
@@ -52,10 +52,13 @@ def test_an_order_that_is_known_is_used() -> None:
     assert left.tolist() == [0, 2]
 
 
-def test_split_keeps_order() -> None:
-    streams = torch.arange(5)
-    episodes, _ = find_episodes(streams, torch.ones(5, dtype=torch.bool))
-    assert [part.rows.flatten().tolist() for part in episodes.split(2)] == [[0, 1], [2, 3], [4]]
+def test_pieces_of_one_run_or_several_keep_the_order() -> None:
+    episodes, _ = find_episodes(torch.arange(5), torch.ones(5, dtype=torch.bool))
+    for run in (None, torch.tensor([2] * 5)):
+        pieces = split_runs(episodes, run, [0, 0, 0], each=2, together=9)
+        rows = [(piece.runs, piece.episodes.rows.flatten().tolist()) for piece in pieces]
+        number = 0 if run is None else 2
+        assert rows == [([number], part) for part in ([0, 1], [2, 3], [4])]
 
 
 @settings(max_examples=50, deadline=None)

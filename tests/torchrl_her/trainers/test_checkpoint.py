@@ -422,7 +422,7 @@ def test_rows_of_two_dimensions_go_on(sampler: str, tmp_path: Path) -> None:
     ("sampler", "capacity", "full", "message"),
     [
         ("uniform", 64, True, "the buffer must be empty, it holds 15 rows"),
-        ("uniform", 65, False, "that of a buffer of 64 rows, not of 65"),
+        ("uniform", 65, False, "the state is of a buffer of 64 rows, not of 65"),
         ("in order", 64, False, "that of a RandomSampler, not of a SamplerWithoutReplacement"),
         ("prioritized", 64, False, "that of a RandomSampler, not of a PrioritizedSampler"),
     ],

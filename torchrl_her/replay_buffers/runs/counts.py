@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, astuple, dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from torch import Tensor
 
 from torchrl_her.goals.rewards import missed
-from torchrl_her.replay_buffers.runs.chunk import Chunk
+from torchrl_her.replay_buffers.runs.pieces import Chunk
 from torchrl_her.replay_buffers.runs.written import WrittenRows
 
 
@@ -32,7 +32,7 @@ class WriterCounts:
     @classmethod
     def sum(cls, counts: Iterable[WriterCounts]) -> WriterCounts:
         """Returns the sums over several counts."""
-        return cls(*map(sum, zip(*map(astuple, counts), strict=True)))
+        return cls(*map(sum, zip(*(vars(each).values() for each in counts), strict=True)))
 
 
 class RunCounts:
@@ -47,9 +47,9 @@ class RunCounts:
 
     Example:
         >>> run_counts = RunCounts(2)
-        >>> run_counts.add([1], real=[3])
+        >>> run_counts.add([1], [WriterCounts(real=3)])
         >>> run_counts.empty(1)
-        >>> run_counts.add([0, 1], real=[1, 2])
+        >>> run_counts.add([0, 1], [WriterCounts(real=1), WriterCounts(real=2)])
         >>> [counts.real for counts in run_counts.counts], [totals.real for totals in run_counts.totals]
         ([1, 2], [1, 5])
     """
@@ -57,17 +57,11 @@ class RunCounts:
     def __init__(self, runs: int) -> None:
         self.counts, self.totals = ([WriterCounts() for _ in range(runs)] for _ in range(2))
 
-    def add(self, runs: Sequence[int], **numbers: Sequence[int]) -> None:
-        """Adds to the counts of some runs.
-
-        Args:
-            runs: m numbers of runs.
-            **numbers: the fields of :class:`WriterCounts`, m numbers each.
-        """
-        for position, run in enumerate(runs):
-            for counts in (self.counts[run], self.totals[run]):
-                for name, values in numbers.items():
-                    setattr(counts, name, getattr(counts, name) + values[position])
+    def add(self, runs: Sequence[int], added: Sequence[WriterCounts]) -> None:
+        """Adds to the counts of m runs, given by their numbers."""
+        for run, more in zip(runs, added, strict=True):
+            for counts in (self.counts, self.totals):
+                counts[run] = WriterCounts.sum((counts[run], more))
 
     def empty(self, run: int) -> None:
         """Counts a run from 0 again; its totals are kept."""
@@ -86,25 +80,35 @@ class RunCounts:
         self.totals = [WriterCounts(**counts) for counts in state_dict["totals"]]
 
 
-def real_positives(chunk: Chunk, real: WrittenRows) -> dict[str, list[int]]:
-    """Returns how many real transitions achieved their goal, as :meth:`RunCounts.add` takes it."""
-    return {"real_positive": _set(real.reward >= chunk.options.achieved_reward, real.counts)}
+def count_rows(
+    chunk: Chunk, real: WrittenRows, virtual: WrittenRows | None, relabeled: Sequence[int]
+) -> list[WriterCounts]:
+    """Counts the transitions of each of a chunk's m runs.
 
+    With the filter, all positive virtual transitions are useful: none of their goals was achieved before.
 
-def virtual_positives(chunk: Chunk, virtual: WrittenRows) -> dict[str, list[int]]:
-    """Returns how many virtual transitions achieved their goal, as :meth:`RunCounts.add` takes it.
-
-    With the filter all of them are useful: none of their goals was achieved before.
+    Args:
+        chunk: Episodes of m runs.
+        real, virtual: the transitions that are written for it; None without virtual ones.
+        relabeled: m numbers of real transitions that got goals of their own episode.
     """
     least = chunk.options.achieved_reward
-    positive = useful = virtual.reward >= least
-    if not chunk.options.filter_achieved:
-        before = chunk.before()[virtual.root]
-        useful = positive & missed(chunk.reward_fn, before, virtual.changes[chunk.keys.goals[0]], least)
-    return {
-        "virtual_positive": _set(positive, virtual.counts),
-        "useful_virtual_positive": _set(useful, virtual.counts),
+    columns = {
+        "real": real.counts,
+        "relabeled": relabeled,
+        "real_positive": _set(real.reward >= least, real.counts),
     }
+    if virtual is not None:
+        positive = useful = virtual.reward >= least
+        if not chunk.options.filter_achieved:
+            before = chunk.before()[virtual.root]
+            useful = positive & missed(chunk.reward_fn, before, virtual.changes[chunk.keys.goals[0]], least)
+        columns["virtual"], columns["virtual_positive"] = virtual.counts, _set(positive, virtual.counts)
+        columns["useful_virtual_positive"] = _set(useful, virtual.counts)
+    return [
+        WriterCounts(**dict(zip(columns, numbers, strict=True)))
+        for numbers in zip(*columns.values(), strict=True)
+    ]
 
 
 def _set(flags: Tensor, counts: Sequence[int]) -> list[int]:

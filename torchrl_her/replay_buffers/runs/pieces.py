@@ -1,14 +1,19 @@
-"""Splits episodes of several runs into pieces, each of which is written at once."""
+"""Splits episodes of one or several runs into pieces, each of which is relabeled and written at once."""
 
 from __future__ import annotations
 
 from collections.abc import Hashable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor
 
+from torchrl_her.goals.rewards import Outcome, RewardFunction
 from torchrl_her.replay_buffers.episodes import Episodes
+from torchrl_her.replay_buffers.keys import TransitionKeys, failures
+from torchrl_her.replay_buffers.options import HindsightOptions
 
 
 class Piece(NamedTuple):
@@ -43,6 +48,44 @@ class Piece(NamedTuple):
         return [numbers[run_index] for run_index in self.runs]
 
 
+@dataclass(frozen=True)
+class Chunk:
+    """Episodes that are relabeled and written together.
+
+    Attributes:
+        rows: [n], collected transitions; other episodes are among them.
+        run: [n] int64, the run of each row; None if there is only one.
+        piece: Positions of the episodes in ``rows``, by run.
+        reward_fn: Maps (achieved, desired) goals to (reward, terminated).
+        options: Number, sources and filter of virtual goals.
+        keys: Names of the entries.
+    """
+
+    rows: TensorDictBase
+    run: Tensor | None
+    piece: Piece
+    reward_fn: RewardFunction
+    options: HindsightOptions
+    keys: TransitionKeys
+
+    @property
+    def episodes(self) -> Episodes:
+        """Positions of the episodes in ``rows``."""
+        return self.piece.episodes
+
+    def before(self) -> Outcome:
+        """Returns the goals [n, g] that were achieved before the actions."""
+        return self.keys.before(self.rows, self.reward_fn)
+
+    def after(self) -> Outcome:
+        """Returns the goals [n, g] that the actions achieved."""
+        return self.keys.after(self.rows, self.reward_fn)
+
+    def failures(self) -> tuple[Tensor, Tensor]:
+        """Returns ``(failed, cost)``, [n, 1] each; see :func:`~torchrl_her.replay_buffers.keys.failures`."""
+        return failures(self.rows, self.keys, self.reward_fn, self.options.achieved_reward)
+
+
 def split_runs(
     episodes: Episodes, run: Tensor | None, settings: Sequence[Hashable], *, each: int, together: int
 ) -> Iterator[Piece]:
@@ -60,9 +103,6 @@ def split_runs(
         together: most entries in the table of several runs' episodes.
     """
     if len(episodes.lengths) == 0:
-        return
-    if run is None:
-        yield from (Piece([0], part) for part in episodes.split(max(1, each // episodes.rows.shape[1])))
         return
     waiting: dict[Hashable, list[_Share]] = {}
     for share in _shares(episodes, run, len(settings), each):
@@ -85,9 +125,11 @@ class _Share(NamedTuple):
     horizon: int  # length of the run's longest episode
 
 
-def _shares(episodes: Episodes, run: Tensor, runs: int, each: int) -> Iterator[_Share]:
-    numbers = run.bincount(minlength=runs).tolist()
-    longest = episodes.lengths.new_zeros(runs).scatter_reduce_(0, run, episodes.lengths, "amax").tolist()
+def _shares(episodes: Episodes, run: Tensor | None, runs: int, each: int) -> Iterator[_Share]:
+    numbers, longest = [len(episodes.lengths)], [episodes.rows.shape[1]]
+    if run is not None:
+        numbers = run.bincount(minlength=runs).tolist()
+        longest = episodes.lengths.new_zeros(runs).scatter_reduce_(0, run, episodes.lengths, "amax").tolist()
     begin = 0
     for run_index, (number, horizon) in enumerate(zip(numbers, longest, strict=True)):
         at_once = max(1, each // max(1, horizon))
@@ -107,6 +149,8 @@ def _join(episodes: Episodes, shares: list[_Share]) -> Piece:
         parts = [slice(share.begin, share.begin + share.number) for share in shares]
         rows = torch.cat([episodes.rows[part] for part in parts])
         lengths = torch.cat([episodes.lengths[part] for part in parts])
-    numbers = torch.tensor([share.number for share in shares], device=lengths.device)
-    position = torch.arange(len(shares), device=lengths.device).repeat_interleave(numbers)
+    position = None
+    if len(shares) > 1:
+        numbers = torch.tensor([share.number for share in shares], device=lengths.device)
+        position = torch.arange(len(shares), device=lengths.device).repeat_interleave(numbers)
     return Piece([share.run for share in shares], Episodes(rows[:, :horizon], lengths), position)

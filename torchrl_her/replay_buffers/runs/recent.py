@@ -99,8 +99,7 @@ class RecentGoals:
         parts = [goals for run in runs if (goals := self.goals[name][run]) is not None]
         goals = parts[0] if len(parts) == 1 else torch.cat([part.to(parts[-1]) for part in parts])
         lengths = torch.tensor([len(part) for part in parts], device=goals.device)
-        step = torch.arange(int(lengths.max()), device=goals.device).minimum(lengths.unsqueeze(-1) - 1)
-        return goals, Episodes((lengths.cumsum(0) - lengths).unsqueeze(-1) + step, lengths)
+        return goals, Episodes.consecutive(lengths.cumsum(0) - lengths, lengths)
 
     def state_dict(self) -> dict[str, Any]:
         """Returns tensors and plain data that :meth:`from_state` takes."""

@@ -18,7 +18,64 @@ from torchrl_her.replay_buffers.runs.trees import SumTrees
 from torchrl_her.torchrl_private import generator_of
 
 
-class RunsSampler(StateFile, Sampler):
+class _BlockSampler(StateFile, Sampler):
+    """Sampler of a storage that is R equal blocks of rows, one block for each run."""
+
+    capacity: int  # rows of a block
+    runs: int
+    generators: list[torch.Generator] | None
+    _home: torch.device
+    _sizes: Tensor  # [R], filled rows of each block
+
+    @property
+    def device(self) -> torch.device:
+        """Device on which rows are drawn, and priorities kept."""
+        return self._home
+
+    def _share(self, storage: Storage, batch_size: int) -> int:
+        """Returns the number of transitions of each run in a batch, checked."""
+        if not bool(self._sizes.any()):
+            raise RuntimeError("an empty buffer cannot be sampled from")
+        if batch_size % self.runs:
+            raise ValueError(f"batch_size must be a multiple of {self.runs} runs, got {batch_size}")
+        if storage.max_size != self.runs * self.capacity:
+            raise ValueError(
+                f"the storage must have {self.runs} blocks of {self.capacity:,} rows, "
+                f"got one of {storage.max_size:,} rows"
+            )
+        return batch_size // self.runs
+
+    def _sources(self) -> Generators:
+        """Returns a generator for each run."""
+        return [generator_of(self)] if self.generators is None else self.generators
+
+    def _rows(self, place: Tensor, filled: Sequence[bool]) -> Tensor:
+        """Converts places [R, n] in the blocks to rows [R * n]; empty runs get the rows of a filled run."""
+        first_rows = torch.arange(0, self.runs * self.capacity, self.capacity, device=place.device)
+        row = place + first_rows.unsqueeze(-1)
+        if not all(filled):
+            stand_in = list(filled).index(True)
+            row = row[[run if has_rows else stand_in for run, has_rows in enumerate(filled)]]
+        return row.flatten()
+
+    def _run_and_place(self, index: int | Tensor) -> tuple[Tensor, Tensor]:
+        """Returns the run of each row that was written, and its place in the run's block."""
+        index = torch.as_tensor(index, dtype=torch.int64, device=self.device).flatten()
+        if len(index) and int(index.min()) < 0:
+            index = index[index >= 0]  # writers give -1 for rows that they did not write
+        run = index.div(self.capacity, rounding_mode="floor")
+        return run, index - run * self.capacity
+
+    def _note(self, run: Tensor, place: Tensor) -> None:
+        """Enlarges the sizes of blocks so that they hold rows that were written."""
+        self._sizes.scatter_reduce_(0, run, place + 1, "amax")
+
+    def _check_state(self, state_dict: dict[str, Any]) -> None:
+        if len(state_dict["sizes"]) != self.runs:
+            raise ValueError(f"the state is of {len(state_dict['sizes'])} runs, not of {self.runs}")
+
+
+class RunsSampler(_BlockSampler):
     """Draws the same number of transitions of each of R runs, uniformly within each run.
 
     The storage is R equal blocks of rows, as :class:`~torchrl_her.HERWriter` fills them. A batch is R equal
@@ -47,27 +104,22 @@ class RunsSampler(StateFile, Sampler):
         generators: Sequence[torch.Generator] | None = None,
         device: torch.device | str = "cpu",
     ) -> None:
-        self.capacity, self.runs = capacity, runs
+        self.capacity, self.runs, self._home = capacity, runs, torch.device(device)
         self.generators = check_generators(runs, generators)
         self._sizes = torch.zeros(runs, dtype=torch.int64, device=device)
 
-    @property
-    def device(self) -> torch.device:
-        """Device on which rows are drawn."""
-        return self._sizes.device
-
     def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict[str, Any]]:
         """Draws indices [batch_size] of rows: R equal blocks."""
-        n, sizes = _share(self, storage, batch_size), self._sizes.tolist()
+        n, sizes = self._share(storage, batch_size), self._sizes.tolist()
         place = torch.zeros(self.runs, n, dtype=torch.int64, device=self.device)
-        for block, size, generator in zip(place, sizes, generators_of(self), strict=True):
+        for block, size, generator in zip(place, sizes, self._sources(), strict=True):
             if size:
                 block.random_(size, generator=generator)
-        return rows_of(place, [size > 0 for size in sizes], self.capacity), {}
+        return self._rows(place, [size > 0 for size in sizes]), {}
 
     def mark_update(self, index: int | Tensor, *, storage: Storage | None = None) -> None:
         """Registers rows that were written."""
-        note_sizes(self._sizes, *run_and_place(index, self.capacity, self.device))
+        self._note(*self._run_and_place(index))
 
     def empty_run(self, run: int) -> None:
         """Forgets the transitions of a run."""
@@ -77,14 +129,14 @@ class RunsSampler(StateFile, Sampler):
         return {"sizes": self._sizes.clone()}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        _check_runs(state_dict["sizes"], self.runs)
+        self._check_state(state_dict)
         self._sizes.copy_(state_dict["sizes"])
 
     def _empty(self) -> None:
         self._sizes.zero_()
 
 
-class RunsPrioritizedSampler(StateFile, PrioritizedSampler):
+class RunsPrioritizedSampler(_BlockSampler, PrioritizedSampler):
     """Draws transitions of each of R runs in proportion to their priorities.
 
     It is TorchRL's ``PrioritizedSampler`` for R runs: with ``p = (|priority| + eps) ** alpha``, a row is
@@ -93,9 +145,8 @@ class RunsPrioritizedSampler(StateFile, PrioritizedSampler):
     A run whose p are all 0 draws all its rows equally often, with weight 1.
     Schaul et al., Prioritized Experience Replay, 2016.
 
-    The storage is R equal blocks of rows, as :class:`~torchrl_her.HERWriter` fills them. A batch is R equal
-    blocks, too, in the order of the runs. What a run draws does not depend on the other runs. In place of a
-    run without transitions, rows of the first run that has some are given.
+    Storage, batches and runs without transitions are as in
+    :class:`~torchrl_her.replay_buffers.RunsSampler`.
 
     Args:
         capacity: rows of each run's block.
@@ -145,16 +196,10 @@ class RunsPrioritizedSampler(StateFile, PrioritizedSampler):
 
     def _init(self) -> None:
         """Makes the trees; called by TorchRL's constructor."""
-        device = self._home
-        self._trees = SumTrees(self.capacity, runs=self.runs, device=device)
-        self._sizes = torch.zeros(self.runs, dtype=torch.int64, device=device)
-        self._most = torch.ones(self.runs, device=device)  # the largest priority of each run
+        self._trees = SumTrees(self.capacity, runs=self.runs, device=self.device)
+        self._sizes = torch.zeros(self.runs, dtype=torch.int64, device=self.device)
+        self._most = torch.ones(self.runs, device=self.device)  # the largest priority of each run
         self._warned: set[int] = set()  # runs that had priorities that are not finite
-
-    @property
-    def device(self) -> torch.device:
-        """Device on which priorities are kept and rows are drawn."""
-        return self._home
 
     @property
     def alpha(self) -> float:
@@ -176,10 +221,10 @@ class RunsPrioritizedSampler(StateFile, PrioritizedSampler):
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict[str, Any]]:
         """Draws indices [batch_size] of rows, R equal blocks, with their importance weights."""
-        n = _share(self, storage, batch_size)
+        n = self._share(storage, batch_size)
         filled = (self._sizes > 0).tolist()
         counts = [n * has_rows for has_rows in filled]
-        u = uniform(counts, 1, generators_of(self), dtype=torch.float64, device=self.device)
+        u = uniform(counts, 1, self._sources(), dtype=torch.float64, device=self.device)
         if not all(filled):
             drawn = torch.tensor(filled, device=u.device).view(-1, 1, 1).expand(-1, n, 1)
             u = u.new_zeros(self.runs, n, 1).masked_scatter_(drawn, u)
@@ -192,7 +237,7 @@ class RunsPrioritizedSampler(StateFile, PrioritizedSampler):
             evenly = torch.minimum((u * sizes).long(), sizes - 1).clamp_min_(0)
             place = torch.where(none, evenly, place)
             weight.masked_fill_(none, 1.0)
-        return rows_of(place, filled, self.capacity), {"priority_weight": weight.flatten()}
+        return self._rows(place, filled), {"priority_weight": weight.flatten()}
 
     @torch.no_grad()
     def update_priority(
@@ -218,7 +263,7 @@ class RunsPrioritizedSampler(StateFile, PrioritizedSampler):
         priority = torch.as_tensor(priority, dtype=torch.float32, device=self.device).detach().abs().flatten()
         if priority.numel() not in (1, index.numel()):
             raise RuntimeError(f"got {priority.numel()} priorities for {index.numel()} rows")
-        run, place = run_and_place(index, self.capacity, self.device)
+        run, place = self._run_and_place(index)
         priority = priority.expand(index.shape)
         if len(run) < len(index):
             priority = priority[index >= 0]
@@ -234,7 +279,7 @@ class RunsPrioritizedSampler(StateFile, PrioritizedSampler):
             good = written & finite
             run, place, priority, value = run[good], place[good], priority[good], value[good]
         self._most.scatter_reduce_(0, run, priority, "amax")
-        note_sizes(self._sizes, run, place)
+        self._note(run, place)
         self._trees.set(run, place, value)
 
     def _all_known(self, run: Tensor, place: Tensor, sizes: Tensor) -> bool:
@@ -254,8 +299,8 @@ class RunsPrioritizedSampler(StateFile, PrioritizedSampler):
 
     def mark_update(self, index: int | Tensor, *, storage: Storage | None = None) -> None:
         """Gives rows that were written the largest priority of their run."""
-        run, place = run_and_place(index, self.capacity, self.device)
-        note_sizes(self._sizes, run, place)
+        run, place = self._run_and_place(index)
+        self._note(run, place)
         value = (self._most + self._eps).pow(self._alpha)
         self._trees.set(run, place, value.index_select(0, run), sorted=True)
 
@@ -284,7 +329,7 @@ class RunsPrioritizedSampler(StateFile, PrioritizedSampler):
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restores the state that :meth:`state_dict` returned."""
-        _check_runs(state_dict["sizes"], self.runs)
+        self._check_state(state_dict)
         self._init()
         self._sizes.copy_(state_dict["sizes"])
         self._most.copy_(state_dict["most"])
@@ -297,60 +342,6 @@ class RunsPrioritizedSampler(StateFile, PrioritizedSampler):
         return f"{type(self).__name__}(runs={self.runs}, alpha={self._alpha}, beta={self._beta})"
 
 
-AnyRunsSampler = RunsSampler | RunsPrioritizedSampler
-
-
-def _share(sampler: AnyRunsSampler, storage: Storage, batch_size: int) -> int:
-    """Returns the number of transitions of each run in a batch, checked."""
-    if not bool(sampler._sizes.any()):
-        raise RuntimeError("an empty buffer cannot be sampled from")
-    if batch_size % sampler.runs:
-        raise ValueError(f"batch_size must be a multiple of {sampler.runs} runs, got {batch_size}")
-    if storage.max_size != sampler.runs * sampler.capacity:
-        raise ValueError(
-            f"the storage must have {sampler.runs} blocks of {sampler.capacity:,} rows, "
-            f"got one of {storage.max_size:,} rows"
-        )
-    return batch_size // sampler.runs
-
-
-def generators_of(sampler: AnyRunsSampler) -> Generators:
-    """Returns a generator for each run."""
-    return [generator_of(sampler)] if sampler.generators is None else sampler.generators
-
-
-def rows_of(place: Tensor, filled: Sequence[bool], capacity: int) -> Tensor:
-    """Converts places [R, n] in the runs' blocks to rows [R * n]; empty runs get the rows of a filled run."""
-    row = place + torch.arange(0, len(filled) * capacity, capacity, device=place.device).unsqueeze(-1)
-    if not all(filled):
-        stand_in = list(filled).index(True)
-        for run, has_rows in enumerate(filled):
-            if not has_rows:
-                row[run] = row[stand_in]
-    return row.flatten()
-
-
-def run_and_place(
-    index: int | Tensor, capacity: int, device: torch.device | None = None
-) -> tuple[Tensor, Tensor]:
-    """Returns the run of each row that was written and its place in the run's block, on a device."""
-    index = torch.as_tensor(index, dtype=torch.int64, device=device).flatten()
-    if len(index) and int(index.min()) < 0:
-        index = index[index >= 0]  # writers give -1 for rows that they did not write
-    run = index.div(capacity, rounding_mode="floor")
-    return run, index - run * capacity
-
-
-def note_sizes(sizes: Tensor, run: Tensor, place: Tensor) -> None:
-    """Enlarges the sizes [R] of blocks so that they hold rows that were written."""
-    sizes.scatter_reduce_(0, run, place + 1, "amax")
-
-
 def _all_finite(priority: Tensor, value: Tensor) -> bool:
     """Returns whether priorities [n] and their powers are finite; with alpha 0 all powers are 1."""
     return len(value) == 0 or math.isfinite(float(priority.max()) + float(value.max()))  # NaN is the largest
-
-
-def _check_runs(sizes: Tensor, runs: int) -> None:
-    if len(sizes) != runs:
-        raise ValueError(f"the state is of {len(sizes)} runs, not of {runs}")

@@ -7,9 +7,8 @@ from tensordict import TensorDict
 
 from torchrl_her import GoalReward, HindsightOptions
 from torchrl_her.replay_buffers.episodes import Episodes
-from torchrl_her.replay_buffers.runs.chunk import Chunk
-from torchrl_her.replay_buffers.runs.counts import real_positives, virtual_positives
-from torchrl_her.replay_buffers.runs.pieces import Piece
+from torchrl_her.replay_buffers.runs.counts import WriterCounts, count_rows
+from torchrl_her.replay_buffers.runs.pieces import Chunk, Piece
 from torchrl_her.replay_buffers.runs.written import WrittenRows
 
 # Transitions 0 to 3 are at 0, 1, 2, 3.
@@ -29,15 +28,20 @@ def written(reward: list[float], counts: list[int], goals: list[float] | None = 
 
 
 def test_positive_is_what_has_the_reward_of_an_achieved_goal() -> None:
-    real = written([0.0, -1.0, 1.0, -1.0, -0.5], [3, 0, 2])
-    assert real_positives(chunk(), real) == {"real_positive": [2, 0, 0]}
-    assert real_positives(chunk(achieved_reward=-0.5), real) == {"real_positive": [2, 0, 1]}
+    real = written([0.0, -1.0, 1.0, -1.0, -0.5], [3, 2])
+    for least, positive in ((0.0, [2, 0]), (-0.5, [2, 1])):
+        counted = count_rows(chunk(achieved_reward=least), real, None, [2, 1])
+        assert [counts.real_positive for counts in counted] == positive
+        assert [(counts.real, counts.relabeled) for counts in counted] == [(3, 2), (2, 1)]
+        assert WriterCounts.sum(counted).virtual == 0
 
 
 def test_useful_is_what_was_not_achieved_before() -> None:
     """The goals of transitions 0 and 2 are achieved where they are."""
+    real = written([-1.0] * 4, [1, 3])
     virtual = written([0.0, 0.0, 0.0, -1.0], [1, 3], [0.0, 2.0, 2.0, 9.0])
-    positives = {"virtual_positive": [1, 2], "useful_virtual_positive": [0, 1]}
-    assert virtual_positives(chunk(), virtual) == positives
-    filtered = virtual_positives(chunk(filter_achieved=True), virtual)
-    assert filtered == {"virtual_positive": [1, 2], "useful_virtual_positive": [1, 2]}
+    for filtered, useful in ((False, [0, 1]), (True, [1, 2])):
+        counted = count_rows(chunk(filter_achieved=filtered), real, virtual, [1, 3])
+        assert [counts.virtual for counts in counted] == [1, 3]
+        assert [counts.virtual_positive for counts in counted] == [1, 2]
+        assert [counts.useful_virtual_positive for counts in counted] == useful
