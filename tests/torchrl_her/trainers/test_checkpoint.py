@@ -423,8 +423,8 @@ def test_rows_of_two_dimensions_go_on(sampler: str, tmp_path: Path) -> None:
     [
         ("uniform", 64, True, "the buffer must be empty, it holds 15 rows"),
         ("uniform", 65, False, "the state is of a buffer of 64 rows, not of 65"),
-        ("in order", 64, False, "that of a RandomSampler, not of a SamplerWithoutReplacement"),
-        ("prioritized", 64, False, "that of a RandomSampler, not of a PrioritizedSampler"),
+        ("in order", 64, False, "the state is of a RandomSampler, not of a SamplerWithoutReplacement"),
+        ("prioritized", 64, False, "the state is of a RandomSampler, not of a PrioritizedSampler"),
     ],
 )
 def test_buffers_of_another_make_are_refused(sampler: str, capacity: int, full: bool, message: str) -> None:
