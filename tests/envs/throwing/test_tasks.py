@@ -77,6 +77,7 @@ def test_options_reach_the_environment() -> None:
     world = WorldConfig(gravity=0.0, max_steps=7, hole_radius=0.1)
     env = make_env("robot_v1", num_envs=5, world=world, num_links=3, dtype=torch.float64)
     assert env.world is world
+    assert env.max_steps == 7
     assert env.batch_size == (5,)
     assert env.action_spec.shape == (5, 4)
     assert env.action_spec.dtype == torch.float64
