@@ -20,7 +20,7 @@ from torchrl_her.goals.instructive import InstructiveWeights
 from torchrl_her.goals.rewards import RewardFunction, call_reward, outcomes
 from torchrl_her.goals.weights import GoalWeights, WeightsOfRuns, checked_weights, weights_by_run
 from torchrl_her.modules.noise import generator_states, set_generator_states
-from torchrl_her.randomness import Generators, check_generators, uniform
+from torchrl_her.randomness import Generators, RunDraws, check_generators, uniform
 
 UpdateOn = Literal["achieved", "proposed"]
 
@@ -35,6 +35,8 @@ class BehaviorGoals(Transform):
     where ``weight`` says how useful a goal is, as for virtual goals. The factors say how well the goal can be
     achieved from the episode's start, and how far it leads to the task's goal. The episode's reward,
     terminated and done are then computed for the proposed goal. All other episodes keep the task's own goal.
+    Two flags [..., 1] are written: ``proposed``, where the goal is a proposed one, and ``proposed_reached``,
+    where a proposed goal was achieved in the episode.
     Leave this transform out of environments for evaluation.
 
     | method | weights | update_on | factors | greedy |
@@ -73,9 +75,6 @@ class BehaviorGoals(Transform):
             episode; if not, the episode is truncated there.
         keys: keys of the entries that are read. All are also written, except observation and achieved goal.
         real_goal_key: key under which the task's own goal is written.
-        proposed_key: key under which a bool [..., 1] is written: whether the goal is a proposed one.
-        reached_key: key under which a bool [..., 1] is written: whether
-            a proposed goal was achieved in the episode.
         stage_key: key of the stage [..., 1] that an episode is played in, if it has one.
         stage: index of the stage in which goals are proposed.
 
@@ -121,8 +120,6 @@ class BehaviorGoals(Transform):
         continues_after_termination: bool = False,
         keys: EnvKeys = EnvKeys(),
         real_goal_key: NestedKey = "real_desired_goal",
-        proposed_key: NestedKey = "proposed",
-        reached_key: NestedKey = "proposed_reached",
         stage_key: NestedKey | None = None,
         stage: int = 0,
     ) -> None:
@@ -134,7 +131,7 @@ class BehaviorGoals(Transform):
         run_weights = weights_by_run(weights, runs)
         keys.check_ends(continues_after_termination=continues_after_termination)
         in_keys = [keys.observation, keys.achieved_goal, keys.desired_goal]
-        out_keys = [keys.desired_goal, real_goal_key, proposed_key, reached_key]
+        out_keys = [keys.desired_goal, real_goal_key, "proposed", "proposed_reached"]
         super().__init__(in_keys=in_keys, out_keys=out_keys)
         self.generators: Generators = check_generators(runs, generators) or [None]
         self.reward_fn, self.weights, self.factors = reward_fn, run_weights, list(factors)
@@ -316,9 +313,7 @@ class BehaviorGoals(Transform):
             place, valid = draw(
                 likelihood,
                 1,
-                generator=lambda shape, dtype, device: uniform(
-                    counts, shape[-1], self.generators, dtype=dtype, device=device
-                ),
+                generator=RunDraws(self.generators, candidates.run),
             )
         goals = candidates.goals.take_along_dim(place.unsqueeze(-1), 1).squeeze(1)
         if not bool(valid.all()):  # without a valid goal, the task's own stays

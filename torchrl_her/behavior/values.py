@@ -97,12 +97,7 @@ class GoalValues:
 
 
 def _blocks(counts: Sequence[int], device: torch.device) -> Tensor:
-    """Returns positions of rows as R equal blocks [R * n]; shorter blocks are padded with row 0.
-
-    Example:
-        >>> _blocks([1, 2], torch.device("cpu")).tolist()
-        [0, 0, 1, 2]
-    """
+    """Returns positions of rows as R equal blocks [R * n]; shorter blocks are padded with row 0."""
     longest, begin, index = max(counts), 0, []
     for count in counts:
         index += [*range(begin, begin + count), *[0] * (longest - count)]

@@ -62,14 +62,12 @@ class GuidedExploration(TensorDictModuleBase):
     Example:
         >>> from tensordict.nn import TensorDictModule, TensorDictSequential
         >>> from torchrl_her import CurriculumStage, make_actor
-        >>> near, far = (
-        ...     CurriculumStage(
-        ...         name=name, observation=[0, 1], achieved_goal=[place], desired_goal=[2], threshold=0.5
-        ...     )
-        ...     for place, name in enumerate(("near", "far"))
-        ... )
+        >>> stages = [
+        ...     CurriculumStage(name=n, observation=[0, 1], achieved_goal=[i], desired_goal=[2], threshold=1)
+        ...     for i, n in enumerate(("near", "far"))
+        ... ]
         >>> actor = make_actor([3], 1, in_keys=["input"])
-        >>> guide = GuidedExploration(actor, Curriculum([near, far], 3), share=1.0)
+        >>> guide = GuidedExploration(actor, Curriculum(stages, 3), share=1.0)
         >>> policy = TensorDictSequential(actor, guide)
         >>> guide.follow(actor, 0)  # the first stage was learned
         >>> _ = [weight.data.zero_() for weight in actor.parameters()]  # what is learned then

@@ -36,13 +36,10 @@ class EpisodeStages(CurriculumProgress):
 
     Example:
         >>> from torchrl_her import CurriculumStage
-        >>> near, far = (
-        ...     CurriculumStage(
-        ...         name=name, observation=[0], achieved_goal=[0], desired_goal=[1], threshold=0.1
-        ...     )
-        ...     for name in ("near", "far")
+        >>> stage = CurriculumStage(
+        ...     name="any", observation=[0], achieved_goal=[0], desired_goal=[1], threshold=0.1
         ... )
-        >>> stages = EpisodeStages(Curriculum([near, far], 2))
+        >>> stages = EpisodeStages(Curriculum([stage, stage], 2))
         >>> stages.shares.tolist()
         [[0.5, 0.5]]
         >>> set(stages.draw([100]).tolist())
@@ -139,13 +136,10 @@ class TeacherStudent(EpisodeStages):
 
     Example:
         >>> from torchrl_her import CurriculumStage
-        >>> near, far = (
-        ...     CurriculumStage(
-        ...         name=name, observation=[0], achieved_goal=[0], desired_goal=[1], threshold=0.1
-        ...     )
-        ...     for name in ("near", "far")
+        >>> stage = CurriculumStage(
+        ...     name="any", observation=[0], achieved_goal=[0], desired_goal=[1], threshold=0.1
         ... )
-        >>> teacher = TeacherStudent(Curriculum([near, far], 2), uniform_share=0.2)
+        >>> teacher = TeacherStudent(Curriculum([stage, stage], 2), uniform_share=0.2)
         >>> teacher.record_episodes(torch.tensor([[50, 50]]), torch.tensor([[40, 0]]))
         >>> [round(share, 2) for share in teacher.shares[0].tolist()]  # only the first one has made progress
         [0.81, 0.19]

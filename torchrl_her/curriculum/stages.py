@@ -306,13 +306,10 @@ class CurriculumProgress:
         ValueError: ``runs`` or ``window`` is below 1, or the threshold is outside of (0, 1].
 
     Example:
-        >>> first, last = (
-        ...     CurriculumStage(
-        ...         name=name, observation=[0], achieved_goal=[0], desired_goal=[1], threshold=0.1
-        ...     )
-        ...     for name in ("first", "last")
+        >>> stage = CurriculumStage(
+        ...     name="any", observation=[0], achieved_goal=[0], desired_goal=[1], threshold=0.1
         ... )
-        >>> progress = CurriculumProgress(Curriculum([first, last], 2), runs=2, window=3)
+        >>> progress = CurriculumProgress(Curriculum([stage, stage], 2), runs=2, window=3)
         >>> progress.record(torch.tensor([[1.0, 1.0, 1.0], [1.0, 0.0, 1.0]])).tolist()
         [True, False]
         >>> progress.stages

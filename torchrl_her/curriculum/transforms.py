@@ -76,13 +76,7 @@ class _StageTransform(Transform):
         return self._get(tensordict, self.stage_key, 1).squeeze(-1)
 
     def _columns(self, columns: Tensor, rows: Tensor | None, device: torch.device) -> Tensor:
-        """Returns the columns [B, n] of the stages of B blocks, or of rows that carry their stages.
-
-        Args:
-            columns: [stages, n], the columns of each stage.
-            rows: stages [...] of the rows; None if each run has one stage.
-            device: device of the result.
-        """
+        """Selects from [stages, n] the columns [B, n] of B blocks, or of rows that carry their stages."""
         stages = self._stages() if rows is None else tuple(range(len(self.curriculum)))
         made_for = stages, device
         if self._table[0] != made_for:
@@ -348,7 +342,7 @@ class StageOutcomes(Transform):
         reward_fn, achieved_reward: decide which goals are achieved in the last stage, where achieving a goal
             need not terminate; see :func:`~torchrl_her.goals.is_achieved`.
         keys: keys of the flags ``terminated`` and ``done``, which are read.
-        stage_key, proposed_key: read; there need not be a ``proposed_key``.
+        stage_key: key of the stage, which is read.
     """
 
     def __init__(
@@ -359,14 +353,13 @@ class StageOutcomes(Transform):
         achieved_reward: float = 0.0,
         keys: EnvKeys = EnvKeys(),
         stage_key: NestedKey = "stage",
-        proposed_key: NestedKey = "proposed",
     ) -> None:
         super().__init__()
-        self.progress, self.stage_key, self.proposed_key = progress, stage_key, proposed_key
+        self.progress, self.stage_key = progress, stage_key
         self.reward_fn, self.achieved_reward, self.keys = reward_fn, achieved_reward, keys
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        done, proposed = next_tensordict.get(self.keys.done), tensordict.get(self.proposed_key, None)
+        done, proposed = next_tensordict.get(self.keys.done), tensordict.get("proposed", None)
         ended = done if proposed is None else done & ~proposed
         if bool(ended.any()):
             stage, runs = tensordict.get(self.stage_key), self.progress.runs

@@ -32,13 +32,11 @@ class StageView:
     Example:
         >>> from tensordict import TensorDict
         >>> from torchrl_her import CurriculumStage, GoalReward
-        >>> near, far = (
-        ...     CurriculumStage(
-        ...         name=name, observation=[0, 1], achieved_goal=[place], desired_goal=[2], threshold=0.5
-        ...     )
-        ...     for place, name in enumerate(("near", "far"))
-        ... )
-        >>> curriculum, names = Curriculum([near, far], 3), ("observation", "achieved_goal", "desired_goal")
+        >>> stages = [
+        ...     CurriculumStage(name=n, observation=[0, 1], achieved_goal=[i], desired_goal=[2], threshold=1)
+        ...     for i, n in enumerate(("near", "far"))
+        ... ]
+        >>> curriculum, names = Curriculum(stages, 3), ("observation", "achieved_goal", "desired_goal")
         >>> state, ended = torch.tensor([[3.0, 1.0, 3.0]]), torch.ones(1, 1, dtype=torch.bool)
         >>> near_goal = {"state": state, **dict(zip(names, curriculum.show(state, 0)))}  # is achieved here
         >>> ends = {"reward": torch.zeros(1, 1), "terminated": ended, "truncated": ~ended, "done": ended}

@@ -74,7 +74,6 @@ class MixedReplay:
     Keyword Args:
         share: fraction of each batch that is demonstrations.
         batch_size: rows of a batch of one run, as the trainer has it.
-        demonstration_key: key of the flag, a bool [..., 1].
 
     Raises:
         ValueError: the share is not between 0 and 1, a batch has no room for both, or the buffers are for
@@ -98,7 +97,6 @@ class MixedReplay:
         *,
         share: float = 0.125,
         batch_size: int = 256,
-        demonstration_key: str = DEMONSTRATION,
     ) -> None:
         if runs_of(collected) != runs_of(demonstrations):
             raise ValueError(
@@ -108,7 +106,6 @@ class MixedReplay:
         self.collected, self.demonstrations = collected, demonstrations
         self.runs, self.batch_size = runs_of(collected), batch_size
         self.shown = demonstration_rows(share, batch_size)
-        self.demonstration_key = demonstration_key
 
     @property
     def writer(self) -> Any:
@@ -148,7 +145,7 @@ class MixedReplay:
             if (weight := rows.get(WEIGHT, None)) is not None:
                 rows.set(WEIGHT, weight / weight.flatten(1).mean(1).view(-1, *[1] * (weight.ndim - 1)))
             flag = torch.full((*rows.shape, 1), buffer is not self.collected, device=rows["index"].device)
-            parts.append(rows.set(self.demonstration_key, flag))
+            parts.append(rows.set(DEMONSTRATION, flag))
         parts[1].set("index", parts[1].get("index") + self.collected.storage.max_size)
         known = [set(part.keys(True, True)) for part in parts]
         both = [part.select(*(known[0] & known[1])) for part in parts]

@@ -6,7 +6,7 @@ goal from the part of a line that the strategy allows.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -128,10 +128,16 @@ def choose_goals(
         if len(rest) > 0:
             at_once = max(1, LIKELIHOODS // width)
             lines = goals[table] if lines is None else lines
-            likelihoods = _likelihoods(candidates, lines, rest.split(at_once), weight, keep)
             dtype = torch.float32 if weight is None else weight.dtype
-            parts = iter(draws.of(rest)((len(rest), k), dtype, line.device).split(at_once))
-            drawn = [draw(likelihood, k, generator=lambda *_: next(parts)) for likelihood in likelihoods]
+            numbers = draws.of(rest)((len(rest), k), dtype, line.device)
+            drawn = []
+            for part, u in zip(rest.split(at_once), numbers.split(at_once), strict=True):
+                likelihood = combine(
+                    between(candidates.first[part], candidates.end[part], width),
+                    None if weight is None else weight[line[part]],
+                    None if keep is None else keep(part, lines[line[part]]),
+                )
+                drawn.append(draw(likelihood, k, generator=lambda *_, u=u: u))
             index[rest], drawable = (torch.cat(part) for part in zip(*drawn, strict=True))
             valid[rest] = drawable.unsqueeze(-1)
     return table.take(begin.unsqueeze(-1) + index), valid
@@ -159,20 +165,3 @@ def _propose(candidates: Candidates, k: int, weight: Tensor | None, draws: RunDr
 
     drawn = draw_weighted(weight, by_line(first), by_line(end), k, generator=numbers)
     return drawn.flatten(0, 1) if place is None else drawn[line, place]
-
-
-def _likelihoods(
-    candidates: Candidates,
-    lines: Tensor,
-    parts: tuple[Tensor, ...],
-    weight: Tensor | None,
-    keep: Keep | None,
-) -> Iterator[Tensor]:
-    """Yields the likelihoods [m, W] of all goals in the lines of transitions, part by part."""
-    for part in parts:
-        line = candidates.line[part]
-        yield combine(
-            between(candidates.first[part], candidates.end[part], lines.shape[1]),
-            None if weight is None else weight[line],
-            None if keep is None else keep(part, lines[line]),
-        )

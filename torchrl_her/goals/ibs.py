@@ -175,18 +175,7 @@ class Instructiveness(InstructiveWeights, GoalHistogram):
 
 
 class HistogramsOfRuns(WeightsOfRuns):
-    """Histograms of several runs over one grid, counted and looked up for all runs at once.
-
-    Args:
-        weights: R, of each run: all :class:`GoalHistogram` or all :class:`Instructiveness`, over one grid.
-
-    Example:
-        >>> grid = GoalGrid(0.0, 1.0, [2])
-        >>> first, second = GoalHistogram(grid), GoalHistogram(grid)
-        >>> HistogramsOfRuns([first, second]).update(torch.tensor([[0.1], [0.2], [0.8]]), [0, 1], [1, 2])
-        >>> first.counts.tolist(), second.counts.tolist()
-        ([1, 0], [1, 1])
-    """
+    """Histograms of several runs over one grid, counted and looked up for all runs at once."""
 
     weights: Sequence[GoalHistogram]
 

@@ -13,9 +13,7 @@ from torchrl_her.checks import check_whole
 from torchrl_her.goals.density import log_kernel_density
 from torchrl_her.goals.grid import Numbers
 from torchrl_her.goals.instructive import InstructiveWeights
-from torchrl_her.goals.weights import spread_evenly
-
-_GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
+from torchrl_her.goals.weights import GOLDEN, spread_evenly
 
 
 class KernelInstructiveness(InstructiveWeights):
@@ -135,7 +133,7 @@ class KernelInstructiveness(InstructiveWeights):
         number = torch.arange(self.written, self.written + len(goals), device=goals.device)
         self.written += len(goals)
         self._move(goals.device)
-        keys = torch.cat([self._keys, (number.double() * _GOLDEN).frac()])
+        keys = torch.cat([self._keys, (number.double() * GOLDEN).frac()])
         keys, order = keys.sort(stable=True)
         order = order[: self.samples]
         self._virtual, self._keys = torch.cat([self._virtual, goals.double()])[order], keys[: self.samples]

@@ -145,17 +145,11 @@ class RareGoals(GoalWeights):
 
 
 class _Reference(NamedTuple):
-    """Points that densities are estimated from.
+    """Points that densities are estimated from."""
 
-    Attributes:
-        samples: [n, g] of float64, goals divided by their scale.
-        scale: [g] of float64.
-        level: the logarithm of the median density.
-    """
-
-    samples: Tensor
-    scale: Tensor
-    level: float
+    samples: Tensor  # [n, g] of float64, goals divided by their scale
+    scale: Tensor  # [g] of float64
+    level: float  # the logarithm of the median density
 
     def to(self, device: torch.device) -> _Reference:
         return _Reference(self.samples.to(device), self.scale.to(device), self.level)

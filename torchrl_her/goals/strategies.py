@@ -144,25 +144,11 @@ def candidate_range(strategy: Strategy, time: Tensor, lengths: Tensor) -> tuple[
 
 
 def check_goal_sources(sources: GoalSources) -> dict[Strategy, int]:
-    """Checks the number of virtual goals that each transition gets from each source.
-
-    A source is a goal strategy, which gives goals of the transition's own episode, or one of two that look
-    beyond it: ``"actual"``, the desired goals of recent episodes, and ``"achieved"``, the goals that were
-    achieved in recent episodes.
-
-    Args:
-        sources: the number of goals, at least 1, of each source.
-
-    Returns:
-        A new dictionary of the same numbers as plain ``int``.
+    """Checks the sources of :class:`~torchrl_her.HindsightOptions`, and makes their numbers plain ``int``.
 
     Raises:
         ValueError: there is no source, an unknown one, or a number below 1.
         TypeError: ``sources`` is not a mapping from sources to numbers.
-
-    Example:
-        >>> check_goal_sources({"future": 2, "actual": 2})
-        {'future': 2, 'actual': 2}
     """
     if not isinstance(sources, Mapping):
         raise TypeError(f"goal_sources must be numbers by source, as in {{'future': 4}}, got {sources!r}")

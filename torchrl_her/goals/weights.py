@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-_GOLDEN = (5**0.5 - 1) / 2
+GOLDEN = (5**0.5 - 1) / 2  # multiples of it have fractional parts that are spread evenly over any range
 
 
 class GoalWeights:
@@ -159,5 +159,5 @@ def spread_evenly(count: int, most: int, device: torch.device | None = None) -> 
     n = min(count, most)
     part = torch.arange(n, device=device)
     begin, end = part * count // max(n, 1), (part + 1) * count // max(n, 1)
-    share = (part.double() * _GOLDEN).frac()  # differs most between neighbors, even over many parts
+    share = (part.double() * GOLDEN).frac()  # differs most between neighbors, even over many parts
     return begin + ((end - begin) * share).long()

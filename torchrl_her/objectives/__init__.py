@@ -1,7 +1,6 @@
 """TorchRL's losses of DDPG, TD3, SAC, TQC and DQN, with clamped targets and costs of actions."""
 
-from torchrl_her.objectives.action_cost import action_cost
-from torchrl_her.objectives.actor_terms import ActorTerms
+from torchrl_her.objectives.actor_terms import ActorTerms, action_cost
 from torchrl_her.objectives.cloning import DEMONSTRATION, Cloning, cloning_terms
 from torchrl_her.objectives.critics import critic_value, critic_values
 from torchrl_her.objectives.ddpg import PenalizedDDPGLoss, make_ddpg_loss

@@ -114,15 +114,7 @@ def least_of_some(values: Tensor, count: int, noise: RunNoise) -> Tensor:
 
 
 def checked_subset(target_critics: int, critics: int) -> int:
-    """Returns the number of critics that are drawn for targets, checked; 0 if all are used.
-
-    Raises:
-        ValueError: the number is not from 0 to the number of critics.
-
-    Example:
-        >>> checked_subset(2, 10), checked_subset(10, 10)
-        (2, 0)
-    """
+    """Returns the number of critics that are drawn for targets, checked; 0 if all are used."""
     if not 0 <= target_critics <= critics:
         raise ValueError(
             f"target_critics must be from 0 (all) to the number of critics, {critics}, got {target_critics}"

@@ -82,21 +82,6 @@ def draw_goals(
     return drawn.row.unsqueeze(-1).expand_as(index)[valid], index[valid]
 
 
-class DrawnGoals(NamedTuple):
-    """Virtual goals that were drawn, and the transitions that get them.
-
-    Attributes:
-        source: [V] int64, the transitions to be relabeled, one after the other, each for up to k goals. Those
-            without a goal that may be drawn are left out.
-        goals: [V, g].
-        relabeled: Number of transitions of each run that got goals of their own episode.
-    """
-
-    source: Tensor
-    goals: Tensor
-    relabeled: list[int]
-
-
 def draw_for_runs(
     chunk: Chunk,
     *,
@@ -104,7 +89,7 @@ def draw_for_runs(
     generators: Generators,
     recent: RecentGoals,
     times: int = 1,
-) -> DrawnGoals:
+) -> tuple[Tensor, Tensor, list[int]]:
     """Draws the virtual goals of episodes of several runs, each run with its own weights and generator.
 
     Goals are drawn for each source apart, by candidate times weight times filter. The candidates of a source
@@ -118,11 +103,15 @@ def draw_for_runs(
         generators: m generators, one for each run.
         recent: the goals of recent episodes of all runs, the episodes of ``chunk`` included.
         times: factor by which the options' number of goals of the same episode is multiplied.
+
+    Returns:
+        ``(source, goals, relabeled)``: the transitions [V] that get a virtual goal, one after the other, each
+        up to k times; the goals [V, g]; and m numbers of transitions that got goals of their own episode.
     """
     rows, piece, reward_fn, options = chunk.rows, chunk.piece, chunk.reward_fn, chunk.options
     episodes = piece.episodes
     if options.k == 0:  # nothing to draw, and achieved goals may be missing
-        return DrawnGoals(episodes.lengths[:0], episodes.lengths[:0], [0] * len(piece.runs))
+        return episodes.lengths[:0], episodes.lengths[:0], [0] * len(piece.runs)
     drawn = _Transitions.of(episodes, options.per)
     after = entry_of(rows, chunk.keys.next_achieved)
     keep = None
@@ -165,7 +154,7 @@ def draw_for_runs(
         row, goals = row.index_select(0, some), goals.index_select(0, some)
     goals = (pools[0] if len(pools) == 1 else torch.cat(pools)).index_select(0, goals)
     relabeled_of = torch.bincount(drawn.episode[relabeled], minlength=len(episodes.lengths))
-    return DrawnGoals(row, goals, piece.sums(relabeled_of))
+    return row, goals, piece.sums(relabeled_of)
 
 
 class _Transitions(NamedTuple):

@@ -169,13 +169,7 @@ def in_root_and_next(keys: Sequence[NestedKey]) -> list[NestedKey]:
 
 
 def device_of(transitions: TensorDictBase) -> torch.device:
-    """Returns the device of transitions, from their entries if a collector's batch has none set.
-
-    Example:
-        >>> from tensordict import TensorDict
-        >>> device_of(TensorDict({"reward": torch.zeros(3)}, [3]))
-        device(type='cpu')
-    """
+    """Returns the device of transitions, from their entries if a collector's batch has none set."""
     if transitions.device is not None:
         return transitions.device
     return next((entry.device for entry in transitions.values(True, True)), torch.device("cpu"))

@@ -43,18 +43,7 @@ def samplers_of(storage: Storage) -> Iterator[Sampler]:
 def refuse_beside_writer(
     name: str, storage: Storage, transitions: TensorDictBase, options: HindsightOptions, *, runs: int
 ) -> None:
-    """Raises an error for a storage, sampler or batch with which a writer with hindsight would be wrong.
-
-    Args:
-        name: name of the writer, for messages.
-        storage: storage into which it writes.
-        transitions: the batch that it is to write.
-        options: options of the writer.
-        runs: number of runs of the writer.
-
-    Raises:
-        ValueError: as in the functions below, or the storage has several dimensions.
-    """
+    """Raises a ValueError for a storage, sampler or batch with which a writer of R runs would be wrong."""
     refuse_padded(name, transitions)
     if storage.ndim > 1:
         raise ValueError(f"{name} needs a storage of 1 dimension, got one of {storage.ndim}")

@@ -74,13 +74,6 @@ class _Stored(NamedTuple):
     recent: dict[tuple[str, int], Tensor]  # rows of the newest episodes, cached
 
 
-class _Ahead(NamedTuple):
-    """Entries of transitions that span several steps."""
-
-    next: TensorDictBase  # [B], of the last step
-    returns: NStepReturn  # for the goals that were chosen
-
-
 class _Chosen(NamedTuple):
     """The changes that a batch needs."""
 
@@ -88,7 +81,7 @@ class _Chosen(NamedTuple):
     rows: Tensor  # [V], places in the flat batch
     goals: Tensor  # [V, g]
     ends: Tensor | None  # [B, 1] of bool, where a sampler of slices ends a slice
-    ahead: _Ahead | None
+    ahead: tuple[TensorDictBase, NStepReturn] | None  # over several steps: ``next`` of the last one, returns
 
 
 class HERSampleUnit(HindsightBase, SampleUnit):
@@ -144,40 +137,22 @@ class HERSampleUnit(HindsightBase, SampleUnit):
             is given a batch for which no goals were chosen.
 
     Example:
-        >>> from tensordict import TensorDict
         >>> from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
         >>> from torchrl_her import GoalReward
-        >>> hindsight = HERSampleUnit(GoalReward(0.5), k=4, strategy="final")
+        >>> from torchrl_her_envs import make_env
+        >>> hindsight = HERSampleUnit(GoalReward(0.1), k=4)
         >>> buffer = TensorDictReplayBuffer(
-        ...     storage=LazyTensorStorage(100),
+        ...     storage=LazyTensorStorage(1000),
         ...     sample_unit=hindsight,
         ...     collate_fn=hindsight.relabel,
         ...     batch_size=1000,
         ... )
-        >>> goals = torch.arange(4.0).unsqueeze(-1)  # a walk along 0, 1, 2, 3; 9 was wanted
-        >>> last = torch.tensor([False, False, True]).unsqueeze(-1)
-        >>> episode = TensorDict(
-        ...     {
-        ...         "achieved_goal": goals[:-1],
-        ...         "desired_goal": torch.full((3, 1), 9.0),
-        ...         "next": {
-        ...             "achieved_goal": goals[1:],
-        ...             "desired_goal": torch.full((3, 1), 9.0),
-        ...             "reward": -torch.ones(3, 1),
-        ...             "terminated": torch.zeros(3, 1, dtype=torch.bool),
-        ...             "truncated": last,
-        ...             "done": last,
-        ...         },
-        ...     },
-        ...     batch_size=[3],
-        ... )
-        >>> _ = buffer.extend(episode)
+        >>> _ = buffer.extend(make_env("hand_v0", num_envs=4, seed=0).rollout(10).reshape(-1))
         >>> batch = buffer.sample()
-        >>> batch["desired_goal"].unique().tolist()
-        [3.0, 9.0]
-        >>> reached = batch["next", "terminated"]
-        >>> batch["achieved_goal"][reached].unique().tolist(), batch["next", "reward"][reached].max()
-        ([2.0], tensor(0.))
+        >>> round(batch["virtual"].float().mean().item(), 1)  # four of five
+        0.8
+        >>> bool((batch["next", "reward"][batch["next", "terminated"]] == 0.0).all())
+        True
     """
 
     def __init__(
@@ -293,7 +268,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
         if len(rows) == 0:
             return out
         if chosen.ahead is not None:
-            reward, terminated = chosen.ahead.returns.reward[rows], chosen.ahead.returns.terminated[rows]
+            reward, terminated = returns.reward[rows], returns.terminated[rows]
         else:
             achieved = self._keys.after(data, self.reward_fn)[rows]
             reward, terminated = ask_reward(self.reward_fn, achieved, chosen.goals)
@@ -383,8 +358,10 @@ class HERSampleUnit(HindsightBase, SampleUnit):
             )
         return _moved(info.get(key), device)
 
-    def _look_ahead(self, stored: _Stored, row: Tensor, virtual: Tensor, goals: Tensor) -> _Ahead:
-        """Computes the n-step returns of rows [B], some of which are virtual and have other goals."""
+    def _look_ahead(
+        self, stored: _Stored, row: Tensor, virtual: Tensor, goals: Tensor
+    ) -> tuple[TensorDictBase, NStepReturn]:
+        """Computes ``next`` and returns over n steps of rows [B], some of which have virtual goals."""
         gamma = self.options.gamma or 1.0  # several steps always have one
         place = stored.episodes.place(row)
         places, inside = windows(place, stored.episodes.episode(place)[1], self.options.n_steps)
@@ -401,7 +378,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
             end[virtual] = own_end | failed[window[virtual]]
         returns = n_step_return(reward, end, inside, gamma)
         last = window.gather(-1, returns.last.unsqueeze(-1)).squeeze(-1)
-        return _Ahead(stored.rows.get("next")[last], returns)
+        return stored.rows.get("next")[last], returns
 
     def _read(self, storage: Storage) -> _Stored:
         """Reads the goals and episodes of a storage; the result is cached until something is written."""

@@ -62,15 +62,3 @@ def split_stages(
         elif bool(which.any()):
             part = Episodes(episodes.rows[which], episodes.lengths[which])
             yield number, rows, part, None if run is None else run[which]
-
-
-def check_stages(stages: Sequence[StageRule] | None) -> list[StageRule]:
-    """Returns the rules of stages as a list; empty without stages.
-
-    Raises:
-        TypeError: one of them is no rule.
-    """
-    for rule in stages or ():
-        if not isinstance(rule, StageRule):
-            raise TypeError(f"stages must be a list of StageRule, got {rule!r} in it")
-    return list(stages or ())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Callable, Hashable, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from multiprocessing.context import get_spawning_popen
 from typing import Any, NamedTuple
 
@@ -25,13 +25,13 @@ from torchrl_her.replay_buffers.keys import device_of, in_root_and_next
 from torchrl_her.replay_buffers.neighbors import SHARED, refuse_beside_writer, refuse_stages
 from torchrl_her.replay_buffers.options import HindsightBase, HindsightOptions
 from torchrl_her.replay_buffers.runs.batches import Batch
-from torchrl_her.replay_buffers.runs.counts import RunCounts, WriterCounts, count_rows
+from torchrl_her.replay_buffers.runs.counts import WriterCounts, count_rows
 from torchrl_her.replay_buffers.runs.pieces import Chunk, split_runs
 from torchrl_her.replay_buffers.runs.recent import RecentGoals
 from torchrl_her.replay_buffers.runs.rings import Places, Rings
 from torchrl_her.replay_buffers.runs.storage import PackedStorage, write_slices
 from torchrl_her.replay_buffers.runs.written import WrittenRows, join_rows, real_rows, virtual_rows
-from torchrl_her.replay_buffers.stage_rules import StageRule, check_stages, split_stages
+from torchrl_her.replay_buffers.stage_rules import StageRule, split_stages
 from torchrl_her.replay_buffers.streams import broken, ends_of_held
 
 # Transitions written at once: larger pieces touch fresh memory each time, smaller ones need more calls.
@@ -149,14 +149,6 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
         [3.0, 3.0, 3.0, 9.0, 9.0, 9.0]
         >>> buffer[:]["next", "reward"].flatten().tolist()
         [-1.0, -1.0, 0.0, -1.0, -1.0, -1.0]
-
-        One goal from the future of the same episode, and one that was really wanted in a recent episode:
-
-        >>> writer = HERWriter(GoalReward(0.5), goal_sources={"future": 1, "actual": 1})
-        >>> buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(100), writer=writer, batch_size=4)
-        >>> _ = buffer.extend(episode)
-        >>> buffer[:]["desired_goal"].flatten().tolist()[1:6:2]  # behind each goal of the future
-        [9.0, 9.0, 9.0]
     """
 
     _cursor: int  # next row of the plain writer, which does not declare its type
@@ -175,7 +167,10 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
         **changes: Any,
     ) -> None:
         self.generators, self.on_write = check_generators(runs, generators), on_write
-        self.stages = check_stages(stages)
+        self.stages = list(stages or ())
+        for rule in self.stages:
+            if not isinstance(rule, StageRule):
+                raise TypeError(f"stages must be a list of StageRule, got {rule!r} in it")
         check_whole(refill=refill, least=1)
         self.refill = refill
         run_weights = weights_by_run(weights, runs)
@@ -188,7 +183,8 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
         self.runs = runs
         # reward functions of runs that do not use ``reward_fn``
         self._own_rewards: dict[int, RewardFunction] = {}
-        self._counts, self._rings = RunCounts(runs), Rings(runs)
+        self._counts, self._totals = ([WriterCounts() for _ in range(runs)] for _ in range(2))
+        self._rings = Rings(runs)
         self._held = Batch.none(runs)  # transitions of open episodes
         self._recent = [RecentGoals.none(runs) for _ in range(max(1, len(self.stages)))]  # by stage
         self._episodes = 0  # copies of episodes ever written, if whole ones are
@@ -204,20 +200,20 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
     @property
     def counts(self) -> WriterCounts:
         """Counts of the transitions of all runs written since the buffer was last emptied."""
-        return WriterCounts.sum(self._counts.counts)
+        return WriterCounts.sum(self._counts)
 
     @property
     def totals(self) -> WriterCounts:
         """Counts of all transitions of all runs that were ever written."""
-        return WriterCounts.sum(self._counts.totals)
+        return WriterCounts.sum(self._totals)
 
     def counts_of(self, run: int) -> WriterCounts:
         """Returns the counts of a run's transitions written since it was last emptied."""
-        return self._counts.counts[run]
+        return self._counts[run]
 
     def totals_of(self, run: int) -> WriterCounts:
         """Returns the counts of all transitions of a run that were ever written."""
-        return self._counts.totals[run]
+        return self._totals[run]
 
     @property
     def capacity(self) -> int:
@@ -339,7 +335,8 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
         state.update(self._held.state_dict())
         state["recent"] = [recent.state_dict() for recent in self._recent]
         state["episodes"], state["all_over"] = self._episodes, self._all_over
-        state.update(self._counts.state_dict())
+        for name, counts in (("counts", self._counts), ("totals", self._totals)):
+            state[name] = [asdict(run_counts) for run_counts in counts]
         state["weights"] = [weights.state_dict() for weights in self.goal_weights]
         return state
 
@@ -361,7 +358,9 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
         self._recent = [RecentGoals.from_state(saved) for saved in recent]
         self._episodes, self._all_over = state_dict["episodes"], state_dict["all_over"]
         self._loaded = True
-        self._counts.load_state_dict(state_dict)
+        self._counts, self._totals = (
+            [WriterCounts(**run_counts) for run_counts in state_dict[name]] for name in ("counts", "totals")
+        )
         for weights, saved in zip(self.goal_weights, state_dict["weights"], strict=False):
             weights.load_state_dict(saved)
 
@@ -378,7 +377,7 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
         Call :func:`~torchrl_her.replay_buffers.empty_run` instead, which also empties the sampler.
         """
         self._rings.empty(run)
-        self._counts.empty(run)
+        self._counts[run] = WriterCounts()
         self._held = self._held.without_run(run)
         self._recent = [recent.without_run(run) for recent in self._recent]
         if self.goal_weights:
@@ -454,7 +453,7 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
 
     def _times(self, run: int) -> int:
         """Returns the factor for a run's number of goals, which makes up for transitions without goals."""
-        counts = self._counts.counts[run]
+        counts = self._counts[run]
         if self.refill == 1 or not counts.real:
             return 1
         return min(self.refill, max(1, round(counts.real / max(1, counts.relabeled))))
@@ -463,17 +462,17 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
         """Returns the transitions of some episodes. Nothing is written or counted yet."""
         runs = chunk.piece.runs
         weights = self.goal_weights if weighted else []
-        drawn = draw_for_runs(
+        source, goals, relabeled = draw_for_runs(
             chunk,
             weights=self._weights_of_runs() if weights and not weights[runs[0]].is_uniform else None,
             generators=[self._rng] if self.generators is None else [self.generators[run] for run in runs],
             recent=recent,
             times=self._times(runs[0]),
         )
-        copies = len(drawn.source)
+        copies = len(source)
         real = real_rows(chunk, first_id=first_id + copies)
-        virtual = virtual_rows(chunk, drawn.source, drawn.goals, first_id=first_id) if copies else None
-        numbers = count_rows(chunk, real, virtual, drawn.relabeled)
+        virtual = virtual_rows(chunk, source, goals, first_id=first_id) if copies else None
+        numbers = count_rows(chunk, real, virtual, relabeled)
         ids = copies + len(chunk.episodes.lengths) if self.options.per == "episode" else 0
         return _Draft(chunk.rows, runs, real, virtual, numbers, weighted=weighted, ids=ids)
 
@@ -503,7 +502,9 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
             for place, draft in enumerate(drafts):
                 # Not all at once unless ``on_write`` needs them: that would touch fresh memory.
                 self._store(joined[place] if joined else join(draft), draft.runs, draft.counts)
-                self._counts.add(draft.runs, draft.numbers)
+                for run, added in zip(draft.runs, draft.numbers, strict=True):
+                    for written in (self._counts, self._totals):
+                        written[run] = WriterCounts.sum((written[run], added))
                 places.note(draft.runs, draft.real.root.split(draft.real.counts), draft.counts)
         except Exception:
             for back in reversed(undo):
@@ -516,13 +517,7 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
         return self.goal_weights[0].of_runs(self.goal_weights)
 
     def _store(self, rows: TensorDictBase, runs: list[int], counts: list[int]) -> None:
-        """Writes rows slice by slice, which is far faster than the plain writer's index for each row.
-
-        Args:
-            rows: [m], run after run.
-            runs: indices of the runs in a piece.
-            counts: number of rows of each of these runs.
-        """
+        """Writes rows [m], run after run, by slices: far faster than by the plain writer's index."""
         moves, begin = [], 0
         for run, count in zip(runs, counts, strict=True):
             moves += self._rings.moves(run, begin=begin, count=count, capacity=self.capacity)

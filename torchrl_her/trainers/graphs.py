@@ -128,13 +128,7 @@ class GraphLearner(LossLearner):
 
 
 class _Recorded:
-    """Function that is called directly at first, then recorded as a CUDA graph, and launched from then on.
-
-    Args:
-        call: function that makes the same computation for all rows of the same shape.
-        device: GPU on which it runs.
-        generators: generators of its random numbers, besides torch's own.
-    """
+    """Function that is called directly at first, then recorded as a CUDA graph, and launched from then on."""
 
     def __init__(
         self,

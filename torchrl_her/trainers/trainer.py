@@ -34,33 +34,29 @@ class Schedule(Protocol):
 
 
 class Replay(Protocol):
-    """Protocol of a replay buffer in the training loop: TorchRL's own, or one that mixes several."""
+    """Protocol of a replay buffer in the training loop: TorchRL's own, or one that mixes several.
+
+    Its length is the number of rows that a single run can learn from. It samples rows of whole batches, R
+    equal blocks in the order of the runs, with an entry ``index``.
+
+    Attributes:
+        writer: writer of collected batches, for one run or several.
+        priority_key: key of new priorities.
+    """
 
     @property
-    def writer(self) -> Any:
-        """Writer of collected batches, for one run or several."""
-        ...
+    def writer(self) -> Any: ...
 
     @property
-    def priority_key(self) -> str:
-        """Key of new priorities."""
-        ...
+    def priority_key(self) -> str: ...
 
-    def __len__(self) -> int:
-        """Number of rows that a single run can learn from."""
-        ...
+    def __len__(self) -> int: ...
 
-    def extend(self, data: TensorDictBase) -> Tensor:
-        """Writes a collected batch."""
-        ...
+    def extend(self, data: TensorDictBase) -> Tensor: ...
 
-    def sample(self, batch_size: int) -> TensorDictBase:
-        """Samples rows of whole batches, R equal blocks, with an entry ``index``."""
-        ...
+    def sample(self, batch_size: int) -> TensorDictBase: ...
 
-    def update_tensordict_priority(self, rows: TensorDictBase) -> None:
-        """Updates the priorities of sampled rows."""
-        ...
+    def update_tensordict_priority(self, rows: TensorDictBase) -> None: ...
 
 
 @runtime_checkable

@@ -1,10 +1,9 @@
-"""Counts of the transitions that a writer has written for each run, and of those that achieved their goal."""
+"""Counts of the transitions that a writer has written, and of those that achieved their goal."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 from torch import Tensor
 
@@ -33,51 +32,6 @@ class WriterCounts:
     def sum(cls, counts: Iterable[WriterCounts]) -> WriterCounts:
         """Returns the sums over several counts."""
         return cls(*map(sum, zip(*(vars(each).values() for each in counts), strict=True)))
-
-
-class RunCounts:
-    """Counts of R runs.
-
-    Args:
-        runs: R.
-
-    Attributes:
-        counts: R counts, each since its run was last emptied.
-        totals: R counts of all transitions ever written.
-
-    Example:
-        >>> run_counts = RunCounts(2)
-        >>> run_counts.add([1], [WriterCounts(real=3)])
-        >>> run_counts.empty(1)
-        >>> run_counts.add([0, 1], [WriterCounts(real=1), WriterCounts(real=2)])
-        >>> [counts.real for counts in run_counts.counts], [totals.real for totals in run_counts.totals]
-        ([1, 2], [1, 5])
-    """
-
-    def __init__(self, runs: int) -> None:
-        self.counts, self.totals = ([WriterCounts() for _ in range(runs)] for _ in range(2))
-
-    def add(self, runs: Sequence[int], added: Sequence[WriterCounts]) -> None:
-        """Adds to the counts of m runs, given by their numbers."""
-        for run, more in zip(runs, added, strict=True):
-            for counts in (self.counts, self.totals):
-                counts[run] = WriterCounts.sum((counts[run], more))
-
-    def empty(self, run: int) -> None:
-        """Counts a run from 0 again; its totals are kept."""
-        self.counts[run] = WriterCounts()
-
-    def state_dict(self) -> dict[str, Any]:
-        """Plain data that :meth:`load_state_dict` takes."""
-        return {
-            "counts": [asdict(counts) for counts in self.counts],
-            "totals": [asdict(counts) for counts in self.totals],
-        }
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restores the state that :meth:`state_dict` returned."""
-        self.counts = [WriterCounts(**counts) for counts in state_dict["counts"]]
-        self.totals = [WriterCounts(**counts) for counts in state_dict["totals"]]
 
 
 def count_rows(

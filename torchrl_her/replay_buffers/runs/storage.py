@@ -65,18 +65,13 @@ class PackedStorage(LazyTensorStorage):
         super().__init__(max_size, device=device)
         self._packed: Tensor | None = None  # [max_size, bytes / 8] of int64
         self._views: TensorDictBase | None = None  # the same memory, entry by entry
-        self._fields: tuple[Field, ...] = ()
+        self.fields: tuple[Field, ...] = ()  # position of each entry within a row
         self._number = 0  # number of keys of the views, nested keys included
 
     @property
     def packed(self) -> Tensor | None:
         """All rows as [max_size, m] of int64, whatever the types of entries; None if they are not packed."""
         return self._packed if self._packed is not None and self._storage is self._views else None
-
-    @property
-    def fields(self) -> tuple[Field, ...]:
-        """Position of each entry within a row."""
-        return self._fields
 
     def get(self, index: int | Sequence[int] | slice) -> Any:
         packed = self.packed
@@ -90,7 +85,7 @@ class PackedStorage(LazyTensorStorage):
             rows = packed.index_select(0, index)
         except IndexError:  # negative numbers count from the end
             return super().get(index)
-        return unpack(rows, self._fields)
+        return unpack(rows, self.fields)
 
     def set(self, cursor: Any, data: Any, *, set_cursor: bool = True) -> None:
         super().set(cursor, data, set_cursor=set_cursor)
@@ -122,7 +117,7 @@ class PackedStorage(LazyTensorStorage):
         if not self.initialized:
             self._allocate(tuple(fields), packed.device if self.device == "auto" else self.device)
             self.initialized = True
-        if self.packed is None or self._fields != tuple(fields):
+        if self.packed is None or self.fields != tuple(fields):
             return False
         self.packed[begin : begin + len(packed)] = packed
         self._len = max(self._len, begin + len(packed))  # type: ignore[has-type]
@@ -131,7 +126,7 @@ class PackedStorage(LazyTensorStorage):
 
     def _allocate(self, fields: tuple[Field, ...], device: torch.device | None) -> None:
         width = -(-fields[-1].end // _ALIGNED)
-        self._fields = fields
+        self.fields = fields
         # Zeros, so that the bytes between rows are the same in every checkpoint. On the CPU NumPy makes them,
         # since its zeros take memory only when rows are written; torch.zeros takes all memory at once.
         if device is None or device.type == "cpu":
@@ -153,13 +148,7 @@ class PackedStorage(LazyTensorStorage):
 
 
 def write_slices(storage: TensorStorage, rows: TensorDictBase, moves: Sequence[Move]) -> None:
-    """Writes rows into a storage, slice by slice, and updates its length.
-
-    Args:
-        storage: storage of one dimension.
-        rows: [m].
-        moves: slices of these rows, and the slices of the storage to copy them to.
-    """
+    """Writes rows [m] into a storage of one dimension, slice by slice, and updates its length."""
     entries = dict(rows.items(True, True))
     kept = dict(whole_of(storage).items(True, True)) if storage.initialized else {}
     if kept.keys() != entries.keys():  # also the first time, when the storage is made

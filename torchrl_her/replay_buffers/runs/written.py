@@ -221,17 +221,7 @@ def join_rows(
 
 
 def take_rows(transitions: TensorDictBase, index: Tensor) -> TensorDictBase:
-    """Copies some transitions [m], with their entries that are not tensors.
-
-    Args:
-        transitions: [n].
-        index: [m] int64, positions.
-
-    Example:
-        >>> transitions = TensorDict({"x": torch.tensor([[5], [6], [7]])}, [3])
-        >>> take_rows(transitions, torch.tensor([2, 0]))["x"].tolist()
-        [[7], [5]]
-    """
+    """Copies the transitions at some positions [m], with their entries that are not tensors."""
     out = transitions.apply(partial(_take, index=index), batch_size=index.shape, is_leaf=is_leaf_nontensor)
     return TensorDict(batch_size=index.shape, device=index.device) if out is None else out
 
