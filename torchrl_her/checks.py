@@ -1,4 +1,4 @@
-"""Checks: options that must be whole numbers, tensors that must be finite, entries that must be there."""
+"""Checks: options that must be whole numbers, finite tensors, equal blocks of runs, required entries."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from numbers import Integral
 
 from tensordict import NestedKey, TensorDictBase
-from torch import Tensor
+from torch import Size, Tensor
 
 
 def check_whole(*, least: int = 1, **options: object) -> None:
@@ -58,6 +58,15 @@ def check_finite(tensors: Mapping[str, Tensor]) -> None:
         wrong = tensor[~tensor.isfinite()]
         if len(wrong) > 0:
             raise ValueError(f"{name} must be finite, got {wrong[0].item()} in it")
+
+
+def check_blocks(shape: Size, runs: int) -> None:
+    """Raises a ValueError if a batch of this shape is not one equal block for each run."""
+    if runs > 1 and (len(shape) == 0 or shape[0] % runs):
+        raise ValueError(
+            f"the first dimension of a batch must be {runs} equal blocks, one for each run, got a batch of "
+            f"{list(shape)}"
+        )
 
 
 def entry_of(rows: TensorDictBase, key: NestedKey, *, by: str = "relabeling") -> Tensor:

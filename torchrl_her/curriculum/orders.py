@@ -118,11 +118,7 @@ class TeacherStudent(EpisodeStages):
     Learning, 2017 (arXiv 1707.00183), here with averages that forget in place of windows.
 
     Args:
-        curriculum: the stages.
-
-    Keyword Args:
-        runs: R.
-        generators: generators, one for each run; None for torch's own, with one run only.
+        curriculum, runs, generators: as in :class:`~torchrl_her.curriculum.EpisodeStages`.
         memory: number of later episodes of a stage after which an episode's weight has fallen to 1 / e.
         uniform_share: share of the episodes for which all stages have the same probability.
         still: constant that is added to the progress of each stage, so that changes of success by chance

@@ -336,18 +336,12 @@ class CurriculumProgress:
         # Plain numbers: transforms read them in every step, and must not wait for a device.
         self.stages = (0,) * runs
         self._successes: list[list[float]] = [[] for _ in range(runs)]
-        self._expert = [False] * runs
         self._evaluations = [0] * runs  # evaluations in the present stage
 
     @property
     def stage(self) -> Tensor:
         """The stage of each run, [R] of int64. It is a copy; :meth:`set_stage` moves a run."""
         return torch.tensor(self.stages)
-
-    @property
-    def expert(self) -> Tensor:
-        """Whether each run has ever reached the threshold in the last stage, [R] of bool."""
-        return torch.tensor(self._expert)
 
     @property
     def successes(self) -> list[list[float]]:
@@ -377,7 +371,7 @@ class CurriculumProgress:
         if not 0 <= stage < len(self.curriculum):
             raise ValueError(f"stage must be in [0, {len(self.curriculum) - 1}], got {stage}")
         self.stages = (*self.stages[:run], stage, *self.stages[run + 1 :])
-        self._successes[run], self._expert[run], self._evaluations[run] = [], False, 0
+        self._successes[run], self._evaluations[run] = [], 0
 
     def record(self, successes: Tensor) -> Tensor:
         """Adds samples of success of all runs; see :meth:`record_run`.
@@ -415,7 +409,6 @@ class CurriculumProgress:
         """Returns tensors and plain data that :meth:`load_state_dict` takes."""
         return {
             "stage": self.stage,
-            "expert": self.expert,
             "successes": self.successes,
             "evaluations": self.evaluations,
         }
@@ -431,7 +424,7 @@ class CurriculumProgress:
             raise ValueError(f"the state is of {len(stages)} runs, but there are {self.runs}")
         if not all(0 <= stage < len(self.curriculum) for stage in stages):
             raise ValueError(f"the state's stages are {stages}, but there are {len(self.curriculum)} stages")
-        self.stages, self._expert = stages, state["expert"].tolist()
+        self.stages = stages
         self._successes = [list(samples)[-self.window :] for samples in state["successes"]]
         self._evaluations = list(state["evaluations"])
 
@@ -445,7 +438,6 @@ class CurriculumProgress:
             if self.stages[run] < last:
                 self.set_stage(run, self.stages[run] + 1)
                 return True
-            self._expert[run] = True
         self._evaluations[run] += 1
         if self.stages[run] < last and self._evaluations[run] == self.patience:
             self.set_stage(run, self.stages[run] + 1)

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
-from torchrl_her.checks import entry_of
+from torchrl_her.checks import check_blocks, entry_of
 from torchrl_her.curriculum.orders import EpisodeStages
 from torchrl_her.curriculum.stages import Curriculum, CurriculumProgress
 from torchrl_her.env_keys import EnvKeys
@@ -20,19 +20,7 @@ from torchrl_her.replay_buffers.keys import device_of
 
 
 def take_columns(rows: Tensor, index: Tensor) -> Tensor:
-    """Selects columns of rows; each of B equal blocks of rows has columns of its own.
-
-    Args:
-        rows: [..., width]; the first dimension is B equal blocks.
-        index: [B, n] of int64.
-
-    Returns:
-        [..., n]
-
-    Example:
-        >>> take_columns(torch.tensor([[1, 2], [3, 4]]), torch.tensor([[0], [1]])).tolist()
-        [[1], [4]]
-    """
+    """Selects the columns [..., n] of rows; each of B equal blocks of rows has columns of its own, [B, n]."""
     if len(index) == 1:
         return rows.index_select(-1, index[0])
     blocks = rows.reshape(len(index), -1, rows.shape[-1])
@@ -85,12 +73,7 @@ class _StageTransform(Transform):
 
     def _check_blocks(self, shape: torch.Size) -> None:
         """Raises if a batch of ``shape`` [..., width] is not one equal block for each run."""
-        runs = self.progress.runs if self.run is None else 1
-        if runs > 1 and (len(shape) < 2 or shape[0] % runs):
-            raise ValueError(
-                f"the first dimension of a batch must be {runs} equal blocks, one for each run, "
-                f"got a batch of {list(shape[:-1])}"
-            )
+        check_blocks(shape[:-1], self.progress.runs if self.run is None else 1)
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         if self._shown_in is None:  # later resets may be partial: the other rows stay as they were shown

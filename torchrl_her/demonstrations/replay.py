@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -104,18 +102,9 @@ class MixedReplay:
                 f"{runs_of(collected)} and {runs_of(demonstrations)}"
             )
         self.collected, self.demonstrations = collected, demonstrations
+        self.writer, self.priority_key = collected.writer, collected.priority_key
         self.runs, self.batch_size = runs_of(collected), batch_size
         self.shown = demonstration_rows(share, batch_size)
-
-    @property
-    def writer(self) -> Any:
-        """Writer of the run's own buffer."""
-        return self.collected.writer
-
-    @property
-    def priority_key(self) -> str:
-        """Key of new priorities."""
-        return self.collected.priority_key
 
     def __len__(self) -> int:
         return len(self.collected)

@@ -60,10 +60,7 @@ class GoalHistogram(GoalWeights):
         return float(kl_divergence(q, q_star.to(q))) if q.any() else math.nan
 
     def update(self, goals: Tensor) -> None:
-        self.count(self.grid.cell(goals).flatten())
-
-    def count(self, cells: Tensor) -> None:
-        """Counts goals by their cells [n], int64."""
+        cells = self.grid.cell(goals).flatten()
         self._add(cells.bincount(minlength=self.grid.num_cells), cells)
 
     def _add(self, counts: Tensor, cells: Tensor) -> None:

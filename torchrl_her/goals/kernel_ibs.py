@@ -41,8 +41,6 @@ class KernelInstructiveness(InstructiveWeights):
             ``subtract`` of :class:`~torchrl_her.goals.InstructiveWeights`.
 
     Attributes:
-        sigma: its present value.
-        final_sigma: its value at the end of the schedule.
         written: number of virtual goals since the buffer was last emptied.
 
     Raises:

@@ -152,17 +152,9 @@ class NetworkShape:
 
 
 def hidden_layers(inputs: int, shape: NetworkShape, *, joined: int = 0, runs: int = 1) -> list[nn.Module]:
-    """Makes hidden layers, one after the other: linear, a normalization if there is one, an activation.
+    """Makes hidden layers: linear, a normalization if there is one, an activation.
 
-    Args:
-        inputs: width of the input.
-        shape: width, number and kind of the layers.
-        joined: width of a further input that the second layer takes besides the outputs of the first.
-        runs: R.
-
-    Example:
-        >>> len(hidden_layers(4, NetworkShape()))
-        3
+    The second layer takes ``joined`` further inputs besides the outputs of the first.
     """
     norms: dict[str, Any] = {"layer": StackedLayerNorm, "batch": StackedBatchNorm}
     layers: list[nn.Module] = []

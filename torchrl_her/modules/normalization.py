@@ -15,7 +15,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor, nn
 
-from torchrl_her.checks import check_whole, entry_of
+from torchrl_her.checks import check_blocks, check_whole, entry_of
 from torchrl_her.modules.networks import by_run
 
 _RELATIVE_STD = 1e-4  # relative to the mean: smaller deviations are hardly above float32's rounding
@@ -206,7 +206,7 @@ class RunningNorm(nn.Module):
         if self.frozen:
             return undo
         if runs is None:
-            self._check_blocks(rows.shape)
+            check_blocks(rows.shape, self.runs)
             runs = range(self.runs)
         shares = [rows.numel() // len(runs)] * len(runs) if counts is None else list(counts)
         entries = {key: entry_of(rows, key, by="normalization") for key in self.widths}
@@ -283,7 +283,7 @@ class RunningNorm(nn.Module):
         """
         columns = self.columns_of(key)
         self._check(key, values)
-        self._check_blocks(values.shape[:-1])
+        check_blocks(values.shape[:-1], self.runs)
         if not values.is_floating_point():  # means and deviations would be rounded to whole numbers, too
             values = values.to(torch.get_default_dtype())
         n, mean, std = (statistic[:, columns] for statistic in (self.n, self.mean, self.std))
@@ -324,14 +324,6 @@ class RunningNorm(nn.Module):
         """Raises if an entry has another width."""
         if values.shape[-1] != (width := self.widths[unravel_key(key)]):
             raise ValueError(f"{key!r} must have a width of {width}, got {values.shape[-1]}")
-
-    def _check_blocks(self, shape: torch.Size) -> None:
-        """Raises if a batch of this shape is not one equal block for each run."""
-        if self.runs > 1 and (len(shape) == 0 or shape[0] % self.runs):
-            raise ValueError(
-                f"the first dimension of a batch must be {self.runs} equal blocks, one for each run, got a "
-                f"batch of {list(shape)}"
-            )
 
     def extra_repr(self) -> str:
         return f"{self.widths}, runs={self.runs}, clip={self.clip}, least_std={self.least_std}"

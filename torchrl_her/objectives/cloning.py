@@ -73,19 +73,9 @@ def cloning_terms(
 
 
 def with_cloning(value: Tensor, loss: Any, cloning: Cloning, transitions: TensorDictBase) -> Tensor:
-    """Adds the cloning loss to the loss of an actor.
+    """Adds the cloning loss to an actor's loss, which is one number or one for each row of blocks [..., B].
 
     For stochastic policies the cloned action is the greedy one.
-
-    Args:
-        value: the actor's loss: the mean over all rows, or one number for each row.
-        loss: TorchRL loss that has the actor.
-        cloning: options of cloning.
-        transitions: rows [..., B]; each block of B is averaged by itself.
-
-    Raises:
-        KeyError: rows have no flag.
-        ValueError: the loss has no critics for the Q filter.
     """
     flag = transitions.get(cloning.key, None)
     if flag is None:

@@ -93,17 +93,9 @@ def least_of_some(values: Tensor, count: int, noise: RunNoise) -> Tensor:
     """Returns the least value of all critics, or of some that are drawn at random for each run.
 
     Args:
-        values: [N, ...], the values of N critics, each of which has one equal block for each run.
+        values: [N, ...]; each critic's values are one equal block for each run.
         count: number of critics that are drawn; 0 for all of them.
         noise: draws the critics, if ``count`` is not 0.
-
-    Returns:
-        [...].
-
-    Example:
-        >>> values = torch.tensor([[-1.0, -5.0], [-2.0, -2.0], [-3.0, -1.0]])
-        >>> least_of_some(values, 0, RunNoise()).tolist()
-        [-3.0, -5.0]
     """
     if count == 0:
         return values.amin(0)

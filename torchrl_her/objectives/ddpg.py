@@ -36,20 +36,7 @@ class PenalizedDDPGLoss(DDPGLoss):
 
 @contextmanager
 def actions_of(actor: TensorDictModule) -> Iterator[list[Tensor]]:
-    """Collects the actions [..., a] of each call of an actor in the ``with`` block.
-
-    Args:
-        actor: its first output is the action.
-
-    Example:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> actor = TensorDictModule(nn.Identity(), in_keys=["wish"], out_keys=["action"])
-        >>> with actions_of(actor) as actions:
-        ...     _ = actor(TensorDict({"wish": torch.tensor([[1.0], [2.0]])}, [2]))
-        >>> actions[0].tolist()
-        [[1.0], [2.0]]
-    """
+    """Collects the actions [..., a], its first output, of each call of an actor in the ``with`` block."""
     actions: list[Tensor] = []
 
     def note(_module: nn.Module, _inputs: Any, output: TensorDictBase) -> None:

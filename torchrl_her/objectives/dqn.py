@@ -14,15 +14,13 @@ def make_dqn_loss(
     actor: QValueActor,
     *,
     targets: Targets = Targets(reward_range=(-1.0, 0.0)),
-    double: bool = True,
     reduction: Literal["mean", "none"] = "mean",
 ) -> DQNLoss:
-    """Makes TorchRL's (double) DQN loss with a target network and clamped targets.
+    """Makes TorchRL's double DQN loss (van Hasselt et al., 2016) with a target network and clamped targets.
 
     Args:
         actor: from :func:`~torchrl_her.modules.make_q_actor`.
         targets: discount, and the rewards whose returns targets are clamped to.
-        double: whether the online network chooses the next action (van Hasselt et al., 2016).
         reduction: ``"none"`` gives one loss for each transition [R, B], as stacked networks need it.
 
     Example:
@@ -31,6 +29,6 @@ def make_dqn_loss(
         >>> round(loss.value_estimator.low), round(loss.value_estimator.high)
         (-50, 0)
     """
-    loss = DQNLoss(actor, delay_value=True, double_dqn=double, reduction=reduction)
+    loss = DQNLoss(actor, delay_value=True, double_dqn=True, reduction=reduction)
     loss.make_value_estimator(targets.estimator(loss.value_network, value_key="chosen_action_value"))
     return loss

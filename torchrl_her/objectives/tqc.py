@@ -82,16 +82,11 @@ def make_tqc_loss(
     quantile critics, 2020.
 
     Args:
-        actor: from :func:`~torchrl_her.modules.make_stochastic_actor`, with its generators. Each run that its
-            networks are stacked for has a temperature of its own.
+        actor: from :func:`~torchrl_her.modules.make_stochastic_actor`, with its generators.
         critic: from ``make_critic(..., outputs=M)`` with M quantiles, a second one is made like it; or all N
             critics in a list.
         dropped_quantiles: D; targets leave out the D * N greatest of all N * M quantiles.
-        targets: discount, and the rewards whose returns targets are clamped to; none by default, since they
-            contain entropy: see :func:`~torchrl_her.objectives.make_sac_loss`.
-        temperature: first value of the temperature.
-        terms: further terms of the actor's loss, without a saturation penalty.
-        reduction: ``"none"`` gives one loss for each transition [R, B], as stacked networks need it.
+        targets, temperature, terms, reduction: as in :func:`~torchrl_her.objectives.make_sac_loss`.
 
     Raises:
         ValueError: ``temperature`` is not positive, the list of critics is empty, critics do not say how many

@@ -108,12 +108,6 @@ def failures(
 
     Such an end and its cost do not depend on the goal, so virtual goals get both, too.
 
-    Args:
-        transitions: [n], as collected.
-        keys: keys of the entries.
-        reward_fn: maps (achieved, desired) goals to (reward, terminated).
-        achieved_reward: the reward of an achieved goal.
-
     Returns:
         ``(failed, cost)``, [n, 1] each: bool, and the reward minus the reward function's result, which
         is below 0, or 0 where nothing failed.

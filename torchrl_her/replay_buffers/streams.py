@@ -111,11 +111,7 @@ def broken(
 
 
 def ends_of_held(streams: Tensor, order: Tensor, held: int) -> Tensor:
-    """Returns which transitions are the last of a stream among those that were held back: [n] of bool.
-
-    Args:
-        streams, order, held: arguments of :func:`broken`.
-    """
+    """Returns which transitions are the last of a stream among those that were held back: [n] of bool."""
     rows = order[order < held]
     last = torch.ones_like(rows, dtype=torch.bool)
     last[:-1] = streams[rows[1:]] != streams[rows[:-1]]

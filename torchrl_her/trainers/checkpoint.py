@@ -17,27 +17,29 @@ from torch import Tensor
 from torch.utils.serialization import config
 from torchrl.collectors import BaseCollector
 from torchrl.data import TensorDictReplayBuffer
+from torchrl.data.replay_buffers.samplers import PrioritizedSampler, Sampler, SamplerEnsemble
 from torchrl.data.replay_buffers.storages import Storage
 
 from torchrl_her.files.reading import MoreThanDataError, load_tensors
 from torchrl_her.files.writing import written
 from torchrl_her.replay_buffers.runs.buffer import bounds_of_run, runs_of, sizes_of
+from torchrl_her.replay_buffers.runs.sampler import RunsPrioritizedSampler
 from torchrl_her.replay_buffers.runs.storage import Field, PackedStorage, unpack
 from torchrl_her.torchrl_private import (
+    capacity_of,
     carrier_of,
     last_written,
+    samplers_in,
     set_carrier,
     set_last_written,
     set_length,
     set_next_ids,
 )
-from torchrl_her.trainers.sampler_state import load_sampler_state_dict, sampler_state_dict
 
 _MAGIC = b"torchrl-her checkpoint 1\n"
 _PIECE = 1 << 26  # bytes between two syncs to disk
 _BODY = len(_MAGIC) + hashlib.sha256().digest_size  # start of torch's file
-
-
+_REMAINING = "_remaining_batches"  # of a sampler's pass over the data; TorchRL's states lack it
 _PLAIN = (bool, int, float, str, type(None), torch.Size, torch.dtype)
 
 
@@ -322,3 +324,68 @@ def _load_block(storage: Storage, begin: int, end: int, block: dict[str, Any]) -
     else:
         storage.set(place, rows, set_cursor=False)
         set_length(storage, end)
+
+
+def sampler_state_dict(sampler: Sampler, size: int) -> dict[str, Any]:
+    """Returns the state that decides, together with random numbers, which rows a sampler draws next.
+
+    The state of a prioritized sampler has the rows below ``size``, the filled ones of its storage, alone.
+    """
+    if isinstance(sampler, SamplerEnsemble):
+        # Whole trees of the ensemble's members: the number of filled rows of each is not known here.
+        state: dict[str, Any] = {
+            str(i): sampler_state_dict(part, capacity_of(part)) for i, part in enumerate(samplers_in(sampler))
+        }
+    elif isinstance(sampler, PrioritizedSampler) and not isinstance(sampler, RunsPrioritizedSampler):
+        state = _priorities(sampler, size)
+    else:
+        state = {
+            key: value.clone() if isinstance(value, Tensor) else value
+            for key, value in sampler.state_dict().items()
+        }
+    return {"kind": type(sampler).__name__, "own": state, "remaining": vars(sampler).get(_REMAINING)}
+
+
+def load_sampler_state_dict(sampler: Sampler, state: dict[str, Any]) -> None:
+    """Restores the state that :func:`sampler_state_dict` returned.
+
+    Raises:
+        ValueError: the state is of another kind of sampler.
+    """
+    kind = type(sampler).__name__
+    if state["kind"] != kind:
+        raise ValueError(f"the state is of a {state['kind']}, not of a {kind}")
+    if isinstance(sampler, SamplerEnsemble):
+        for i, part in enumerate(samplers_in(sampler)):
+            load_sampler_state_dict(part, state["own"][str(i)])
+    elif isinstance(sampler, PrioritizedSampler) and not isinstance(sampler, RunsPrioritizedSampler):
+        _load_priorities(sampler, state["own"])
+    else:
+        sampler.load_state_dict(state["own"])
+    if state["remaining"] is not None:
+        setattr(sampler, _REMAINING, state["remaining"])
+
+
+def _priorities(sampler: PrioritizedSampler, size: int) -> dict[str, Any]:
+    """Returns the priorities of filled rows: TorchRL's state holds trees that a safe load refuses."""
+    state, filled = sampler.state_dict(), torch.arange(size)
+    return {
+        "sum": torch.as_tensor(state["_sum_tree"][filled]) if size else None,
+        "min": torch.as_tensor(state["_min_tree"][filled]) if size else None,
+        "max_priority": [
+            None if value is None else torch.as_tensor(value) for value in state["_max_priority"]
+        ],
+        "alpha": float(state["_alpha"]),
+        "beta": float(state["_beta"]),
+    }
+
+
+def _load_priorities(sampler: PrioritizedSampler, saved: dict[str, Any]) -> None:
+    state = sampler.state_dict()
+    if saved["sum"] is not None:
+        filled = torch.arange(len(saved["sum"]))
+        state["_sum_tree"][filled] = saved["sum"]
+        state["_min_tree"][filled] = saved["min"]
+    state["_max_priority"] = tuple(saved["max_priority"])
+    state["_alpha"], state["_beta"] = saved["alpha"], saved["beta"]
+    sampler.load_state_dict(state)

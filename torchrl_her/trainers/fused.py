@@ -22,9 +22,8 @@ from torchrl.objectives.utils import TargetNetUpdater
 from torchrl_her.native.job import Layer, Norm, structures
 from torchrl_her.native.steps import load_steps
 from torchrl_her.trainers.fused_call import FusedCall
-from torchrl_her.trainers.fused_layers import layers_of
 from torchrl_her.trainers.fused_weights import FusedWeights
-from torchrl_her.trainers.fusing import FUSED, is_plain_adam, network_of, why_not_fused
+from torchrl_her.trainers.fusing import FUSED, is_plain_adam, layers_of, network_of, why_not_fused
 from torchrl_her.trainers.learner import check_idle, check_rows, idle_runs
 
 MatmulDtype = Literal["float32", "bfloat16"]

@@ -1,8 +1,8 @@
-"""Checks which losses, target updates and optimizers fused gradient steps can reproduce."""
+"""Checks which losses, networks, target updates and optimizers fused gradient steps can reproduce."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
 from typing import Any
@@ -15,10 +15,16 @@ from torchrl.objectives import DQNLoss, HardUpdate, LossModule, SoftUpdate
 from torchrl.objectives.utils import TargetNetUpdater
 from torchrl.objectives.value import TD0Estimator
 
-from torchrl_her.modules.networks import ActorNet, CriticNet, StackedBatchNorm
+from torchrl_her.modules.networks import (
+    ActorNet,
+    CriticNet,
+    StackedBatchNorm,
+    StackedLayerNorm,
+    StackedLinear,
+)
 from torchrl_her.modules.q_actor import QNet
 from torchrl_her.modules.stochastic_actor import StochasticActorNet
-from torchrl_her.native.job import STOCHASTIC, Algorithm, Norm
+from torchrl_her.native.job import STOCHASTIC, Activation, Algorithm, Layer, Norm
 from torchrl_her.objectives.critics import action_key
 from torchrl_her.objectives.ddpg import PenalizedDDPGLoss
 from torchrl_her.objectives.sac import PenalizedSACLoss
@@ -27,7 +33,6 @@ from torchrl_her.objectives.td3 import PenalizedTD3Loss
 from torchrl_her.objectives.tqc import PenalizedTQCLoss
 from torchrl_her.torchrl_private import has_keyword_arguments
 from torchrl_her.trainers.adam import RunsAdam
-from torchrl_her.trainers.fused_layers import layers_of, tensor_shapes
 
 
 @dataclass(frozen=True)
@@ -103,6 +108,10 @@ FUSED: dict[type[LossModule], FusedLoss] = {
     ),
 }
 
+_NETWORKS = (ActorNet, CriticNet, QNet, StochasticActorNet)
+_ACTIVATIONS = {nn.ReLU: Activation.RELU, nn.Tanh: Activation.TANH, nn.ELU: Activation.ELU}
+_NORMS = {StackedLayerNorm: Norm.LAYERNORM, StackedBatchNorm: Norm.BATCHNORM}
+
 
 def why_not_fused(loss: nn.Module, target: TargetNetUpdater | None) -> str | None:
     """Returns what :class:`~torchrl_her.FusedLearner` would get wrong, for messages; None if nothing.
@@ -158,6 +167,51 @@ def network_of(module: nn.Module) -> nn.Module:
     if isinstance(module, TensorDictSequential):
         module = module[0]
     return module.module  # type: ignore[return-value]
+
+
+def layers_of(net: nn.Module) -> list[Layer] | None:
+    """Returns the layers of one of this library's networks, from its input on; None if others occur.
+
+    The tensors of the layers, in the same order, are those of ``net.state_dict()``: weight and bias, behind
+    them scale and shift of a normalization, and the running mean and variance of a batch normalization.
+
+    Args:
+        net: exactly one of this library's types, since a subclass may compute something else.
+
+    Example:
+        >>> [(layer.inputs, layer.outputs, layer.joined) for layer in layers_of(CriticNet(4, 2))]
+        [(4, 64, 0), (66, 64, 2), (64, 64, 0), (64, 1, 0)]
+    """
+    if type(net) not in _NETWORKS:
+        return None
+    layers: list[Layer] = []
+    fresh = False  # whether the last layer may still get a normalization, or an activation
+    for module in net.modules():
+        if module is net or type(module) is nn.Sequential:
+            continue
+        if type(module) is StackedLinear:
+            inputs, outputs = module.weight.shape[-2:]
+            joined = inputs - layers[-1].outputs if layers else 0
+            layers.append(Layer(inputs, outputs, joined, Activation.NONE, Norm.PLAIN))
+            fresh = True
+        elif type(module) is StackedBatchNorm and not layers and _is_plain_layer(module):
+            layers.append(Layer(0, module.weight.shape[-1], 0, Activation.NONE, Norm.BATCHNORM))
+        elif type(module) in _NORMS and fresh and not layers[-1].norm and _is_plain_layer(module):
+            layers[-1].norm = _NORMS[type(module)]
+        elif type(module) in _ACTIVATIONS and fresh and _is_plain_layer(module):
+            layers[-1].activation, fresh = _ACTIVATIONS[type(module)], False
+        else:
+            return None
+    return layers
+
+
+def tensor_shapes(layers: Sequence[Layer]) -> list[tuple[int, int]]:
+    """Returns the last two dimensions of the parameters and running statistics of layers, in order."""
+    shapes = []
+    for layer in layers:
+        product = [(layer.inputs, layer.outputs), (1, layer.outputs)] if layer.inputs else []
+        shapes += [*product, *[(1, layer.outputs)] * (2 * layer.norm)]
+    return shapes
 
 
 def _obstacles(loss: LossModule, fused: FusedLoss) -> Iterator[str]:
@@ -256,6 +310,12 @@ def _strange_keys(loss: LossModule, fused: FusedLoss) -> Iterator[str]:
         is_ddpg and estimator.tensor_keys.value != value_key
     ):
         yield "targets from other networks than the loss's"
+
+
+def _is_plain_layer(module: nn.Module) -> bool:
+    if isinstance(module, StackedBatchNorm):
+        return module.training
+    return not isinstance(module, nn.ELU) or module.alpha == 1.0
 
 
 def _has_hooks(module: nn.Module, expected: int = 0) -> bool:

@@ -13,10 +13,6 @@ def run_dims(loss: nn.Module) -> dict[str, int]:
     """Returns the dimension of the runs in each entry of a stacked loss's state, by name.
 
     It is the first one; in the parameters of a stack of N critics [N, R, ...] it is the second.
-
-    Example:
-        >>> run_dims(nn.Linear(1, 2, bias=False))
-        {'weight': 0}
     """
     stacked = {
         name: len(getattr(child, "batch_size", ()))

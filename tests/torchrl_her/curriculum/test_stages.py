@@ -213,16 +213,11 @@ def test_a_stage_ends_after_some_evaluations_at_the_latest() -> None:
     assert [again.record(poor).tolist() for _ in range(4)] == 4 * [[False, False]]  # the last one has no end
 
 
-def test_the_last_stage_has_no_end_but_experts() -> None:
+def test_the_last_stage_has_no_end() -> None:
     progress = make_progress(runs=2)
     progress.set_stage(1, 2)
-    assert progress.record(torch.stack((flags("1111"), flags("1110")))).tolist() == [True, False]
-    assert progress.expert.tolist() == [False, True]  # stage 0 was left, but not the last one
-    progress.record_run(1, flags("0000"))
-    assert progress.expert.tolist() == [False, True]  # it was reached
+    assert progress.record(torch.stack((flags("1111"), flags("1111")))).tolist() == [True, False]
     assert progress.stages == (1, 2)
-    progress.set_stage(1, 2)
-    assert progress.expert.tolist() == [False, False]
 
 
 def test_each_run_moves_on_by_itself() -> None:
@@ -288,7 +283,6 @@ def test_state_goes_through_a_file(tmp_path: Path) -> None:
     torch.save(progress.state_dict(), tmp_path / "progress.pt")
     other.load_state_dict(torch.load(tmp_path / "progress.pt", weights_only=True))
     assert other.stages == (0, 1, 2)
-    assert other.expert.tolist() == [False, False, True]
     assert other.successes == [[1.0, 1.0, 0.0, 0.0], [], [1.0] * 4]
     more = flags("11").expand(3, 2)  # goes on as the first one does
     assert other.record(more).tolist() == progress.record(more).tolist() == [False, False, False]

@@ -40,7 +40,7 @@ from torchrl_her.trainers import (
     load_collector_state_dict,
     load_newest_checkpoint,
 )
-from torchrl_her.trainers.sampler_state import load_sampler_state_dict, sampler_state_dict
+from torchrl_her.trainers.checkpoint import load_sampler_state_dict, sampler_state_dict
 from torchrl_her_envs import make_env
 
 from ..her_data import make_batch, same

@@ -145,19 +145,14 @@ class RunsPrioritizedSampler(_BlockSampler, PrioritizedSampler):
     A run whose p are all 0 draws all its rows equally often, with weight 1.
     Schaul et al., Prioritized Experience Replay, 2016.
 
-    Storage, batches and runs without transitions are as in
-    :class:`~torchrl_her.replay_buffers.RunsSampler`.
+    Storage, batches, runs without transitions, and the arguments ``capacity``, ``runs``, ``generators`` and
+    ``device`` are as in :class:`~torchrl_her.replay_buffers.RunsSampler`.
 
     Args:
-        capacity: rows of each run's block.
         alpha: how much priorities count; 0 for not at all.
         beta: how far importance weights make up for priorities; 1 for fully.
 
     Keyword Args:
-        runs: R.
-        generators: R sources of random numbers, on the device; None for the buffer's (``buffer.set_rng``),
-            with one run.
-        device: device on which rows are drawn. The storage may be on another one.
         eps: added to priorities.
         reduction: reduction of priorities that come as several numbers for a row.
 
