@@ -7,6 +7,7 @@ import os
 import signal
 import time
 from pathlib import Path
+from shutil import copytree
 from typing import Any
 
 import matplotlib
@@ -21,7 +22,7 @@ from torchrl_her_recipes.tuning import search as search_module
 from torchrl_her_recipes.tuning.search import SearchResult
 
 from ..studies.here import Here
-from .searches import RECIPE, go_on, is_killed, small_search
+from .searches import go_on, is_killed, small_search
 
 optuna = pytest.importorskip("optuna", reason="needs the extra tune")
 
@@ -35,26 +36,50 @@ def states(result: SearchResult) -> list[str]:
     return [trial.state.name.lower() for trial in result.trials]
 
 
+@pytest.fixture(scope="module")
+def _begun(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("searches") / "search"
+    go_on(small_search(), folder, 1)
+    return folder
+
+
+@pytest.fixture
+def begun(_begun: Path, tmp_path: Path) -> Path:
+    """The folder of a search that has done one trial."""
+    return copytree(_begun, tmp_path / "search")
+
+
 def test_a_search_leaves_the_best_as_a_preset_and_more_trials_can_be_added(tmp_path: Path) -> None:
-    lines: list[str] = []
-    own = make_recipe(RECIPE, goal_sources=None)
-    first = go_on(small_search(goal_sources=None), tmp_path, 2, say=lines.append)
-    assert [line.split(":")[0] for line in lines] == ["trial 0", "trial 1"]
+    """Its first trial is the recipe as it is, even outside of the space and though its process dies once."""
+    space = {
+        "learning_rate": {"kind": "log_float", "low": 1e-5, "high": 1e-4},
+        "hidden": {"kind": "choice", "values": [8, 12]},
+        "tau": {"kind": "float", "low": 0.01, "high": 0.1},
+    }
+    search, lines = small_search(space, pruner="none", goal_sources=None), list[str]()
+    died = Outcome(error="its process was ended by SIGKILL", died=True)
+    first = go_on(search, tmp_path, 2, workers=Actors(trial_0000=[died]), say=lines.append)
+    assert [line.split(":")[0] for line in lines] == ["trial 1", "trial 2"]  # trial 1 repeats trial 0
     before = first.trials
     assert len(before) == 2
     assert len(search_summary(first.study)) == 2  # too early for importances
-    result = go_on(small_search(goal_sources=None), tmp_path, 7, pictures=True)
+    result = go_on(search, tmp_path, 7, pictures=True)
     assert result.trials[:2] == before
     best = result.study.best_trial
     assert best.value == result.best
     assert search_summary(result.study)[0].startswith(f"trial {best.number}: score {best.value:.0%}  ")
     assert "importance (a guess" in search_summary(result.study)[-1]
+    assert "hidden" in search_summary(result.study)[-1]  # importances are of all that is varied
 
-    # The first trial is the recipe as it is, which any other has to beat.
-    assert table(tmp_path)[0]["learning_rate"] == str(own.learner.learning_rate)
+    # Any other trial has to beat the recipe as it is.
+    default, *others = rows = table(tmp_path)
+    assert RunFolder(tmp_path / "trial_0000").recipe() == resolved(search.recipe)
+    assert (default["learning_rate"], default["hidden"], default["tau"]) == ("0.001", "16", "0.05")
+    assert {row["hidden"] for row in others} <= {"8", "12"}
     # Training with the preset repeats the best trial.
     recipe = make_recipe(load_preset(str(tmp_path / "best.yaml")))
-    assert RunFolder(tmp_path / f"trial_{best.number:04}").recipe() == recipe
+    (folder,) = (row["folder"] for row in rows if row["trial"] == str(best.number))
+    assert RunFolder(tmp_path / folder).recipe() == recipe
     assert run_score(recipe) == best.value
     for name in ("history", "importance", "options"):
         with Image.open(tmp_path / f"{name}.png") as picture:
@@ -63,21 +88,6 @@ def test_a_search_leaves_the_best_as_a_preset_and_more_trials_can_be_added(tmp_p
     left = [path.name for path in tmp_path.iterdir() if path.name != ".lock" and path.is_file()]
     expected = ["best.yaml", "search.db", "search.yaml", "trials.csv"]
     assert sorted(left) == sorted([*expected, "history.png", "importance.png", "options.png"])
-
-
-def test_the_first_trial_is_the_recipe_even_outside_of_the_space(tmp_path: Path) -> None:
-    space = {
-        "learning_rate": {"kind": "log_float", "low": 1e-5, "high": 1e-4},
-        "hidden": {"kind": "choice", "values": [8, 12]},
-        "tau": {"kind": "float", "low": 0.01, "high": 0.1},
-    }
-    died = Outcome(error="its process was ended by SIGKILL", died=True)
-    result = go_on(small_search(space), tmp_path, 7, workers=Actors(trial_0000=[died]), pictures=True)
-    assert RunFolder(tmp_path / "trial_0000").recipe() == resolved(small_search(space).recipe)
-    first, *others = table(tmp_path)
-    assert (first["learning_rate"], first["hidden"], first["tau"]) == ("0.001", "16", "0.05")
-    assert {row["hidden"] for row in others} <= {"8", "12"}
-    assert "hidden" in search_summary(result.study)[-1]  # importances are of all that is varied
 
 
 @pytest.mark.long
@@ -121,18 +131,17 @@ def test_a_sampler_whose_package_is_missing_names_the_remedy(monkeypatch: pytest
         search_module.make_sampler("cmaes", 0)
 
 
-def test_what_a_search_was_begun_with_is_asked_for_again(tmp_path: Path) -> None:
-    go_on(small_search(), tmp_path, 1)
+def test_what_a_search_was_begun_with_is_asked_for_again(begun: Path) -> None:
     for other, said in (
         (small_search(sampler="random"), "a search with --sampler=tpe, not --sampler=random: repeat"),
         (small_search(gamma=0.95), "a search with gamma=0.9, not gamma=0.95: repeat its options"),
         (small_search(RANGE), "a search with space.learning_rate={'kind': 'log_float', .*, not space.learn"),
     ):
         with pytest.raises(ValueError, match=said):
-            go_on(other, tmp_path, 1)
-    (tmp_path / "search.yaml").write_text("sampler: tpe")
+            go_on(other, begun, 1)
+    (begun / "search.yaml").write_text("sampler: tpe")
     with pytest.raises(ValueError, match="search.yaml cannot be read: it is damaged"):
-        go_on(small_search(), tmp_path, 1)
+        go_on(small_search(), begun, 1)
 
 
 RANGE = {"learning_rate": {"kind": "float", "low": 1e-4, "high": 1e-2}}
@@ -192,29 +201,27 @@ class Pressed(Here):
 
 
 def test_ctrl_c_ends_a_search_that_goes_on_with_the_same_trials(tmp_path: Path) -> None:
-    result = go_on(small_search(), tmp_path, 3, workers=Pressed())
+    result = go_on(small_search(), tmp_path, 2, workers=Pressed())
     assert result.interrupted
     assert result.trials == []
     (cut,) = (trial for trial in result.study.trials if "repeated" in trial.user_attrs)
-    again = go_on(small_search(), tmp_path, 3)
+    again = go_on(small_search(), tmp_path, 2)
     assert not again.interrupted
-    assert states(again) == ["complete"] * 3
+    assert states(again) == ["complete"] * 2
     assert again.trials[0].params == cut.params
 
 
 def test_a_full_disk_ends_a_search_in_one_line_and_loses_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    begun: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    go_on(small_search(), tmp_path, 1)
-
     def full(*_arguments: object, **_options: object) -> None:
         raise optuna.exceptions.StorageInternalError("while writing") from OSError("no space left on device")
 
     with monkeypatch.context() as patch:
         patch.setattr(optuna.Study, "tell", full)
         with pytest.raises(OSError, match=r"search.db cannot be used \(no space left on device\); the same"):
-            go_on(small_search(), tmp_path, 2)
-    assert states(go_on(small_search(), tmp_path, 2)) == ["complete"] * 2
+            go_on(small_search(), begun, 2)
+    assert states(go_on(small_search(), begun, 2)) == ["complete"] * 2
 
 
 def test_a_search_that_only_fails_ends(tmp_path: Path) -> None:

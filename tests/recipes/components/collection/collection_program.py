@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from copy import deepcopy
 from multiprocessing import active_children
 from pathlib import Path
+from shutil import copytree
 from typing import Any
 
 import torch
@@ -54,13 +55,10 @@ def _sync() -> dict[str, Any]:
     return _run(tagged())
 
 
-def _often() -> dict[str, Any]:
-    """Two gradient steps for each frame, of another learner, with options of exploration."""
-    return _run(tagged(learner="td3", critics=3, target_critics=2, frames_per_update=0.5, action_noise=0.1))
-
-
 def _async() -> dict[str, Any]:
-    return _run(tagged(sync=False))
+    """Two gradient steps for each frame, of another learner, with options of exploration."""
+    td3 = {"learner": "td3", "critics": 3, "target_critics": 2, "action_noise": 0.1}
+    return _run(tagged(sync=False, frames_per_update=0.5, **td3))
 
 
 def _run(recipe: Recipe) -> dict[str, Any]:
@@ -88,29 +86,21 @@ def shown(components: Components, result: RunResult) -> dict[str, Any]:
     }
 
 
-def _resumed() -> dict[str, Any]:
-    """Stopped between two epochs."""
+def _stopped() -> list[dict[str, Any]]:
+    """A run that resumes between its two epochs, and where it was stopped in the middle of the second one."""
     with tempfile.TemporaryDirectory() as folder:
-        run(build(tagged(epochs=1)), f"{folder}/run", progress=False)
-        components = build(tagged())
-        _extend(folder, components)
-        return shown(components, resume(f"{folder}/run", components=components, progress=False))
-
-
-def _extend(folder: str, components: Components) -> None:
-    """The same number of epochs in the folder's recipe."""
-    path = Path(folder, "run", "config.yaml")
-    path.write_text(path.read_text().replace("epochs: 1\n", f"epochs: {components.recipe.run.epochs}\n"))
-
-
-def _stopped() -> dict[str, Any]:
-    """Stopped in the middle of the second epoch."""
-    with tempfile.TemporaryDirectory() as folder:
-        components = build(tagged())
+        between, middle = Path(folder, "between"), Path(folder, "middle")
+        components = build(tagged(checkpoint_interval=1))
         stop_after(components, 13)
-        assert run(components, f"{folder}/run", progress=False).interrupted
-        components = build(tagged())
-        return shown(components, resume(f"{folder}/run", components=components, progress=False))
+        assert run(components, middle, progress=False).interrupted
+        copytree(middle, between)
+        (between / "checkpoint.1.pt").replace(between / "checkpoint.pt")
+        return [_resumed(path) for path in (between, middle)]
+
+
+def _resumed(folder: Path) -> dict[str, Any]:
+    components = build(tagged(checkpoint_interval=1))
+    return shown(components, resume(folder, components=components, progress=False))
 
 
 def _weights() -> dict[str, Any]:
@@ -208,7 +198,9 @@ def _failure(**options: Any) -> dict[str, Any]:
 
 
 def _breaks() -> dict[str, Any]:
-    return _failure(algo="filtered_her", epochs=4, **{"task.options.fails_at": 130})
+    return _failure(
+        algo="filtered_her", epoch_frames=600, warmup_frames=600, **{"task.options.fails_at": 130}
+    )
 
 
 def _cannot_start() -> dict[str, Any]:
@@ -228,8 +220,6 @@ def _killed() -> dict[str, Any]:
 
 JOBS = {
     "sync": _sync,
-    "often": _often,
-    "resumed": _resumed,
     "stopped": _stopped,
     "async": _async,
     "weights": _weights,
