@@ -31,28 +31,28 @@ class PenalizedTD3Loss(TD3Loss):
         **kwargs: keyword arguments of the same class, without ``policy_noise`` and ``noise_clip``.
         terms: the further terms of the actor's loss.
         target_critics: number of critics that are drawn for targets; 0 for all.
+        target_noise: standard deviation of the noise on the target's actions.
+        target_noise_clip: bound of that noise.
         noise: source of the loss's random numbers.
-
-    Attributes:
-        target_noise, target_noise_clip: standard deviation and bound of the noise on the target's actions.
 
     Raises:
         ValueError: ``target_critics`` is not from 0 to the number of critics.
     """
-
-    target_noise, target_noise_clip = 0.2, 0.5  # Fujimoto et al., 2018
 
     def __init__(
         self,
         *args: Any,
         terms: ActorTerms = ActorTerms(),
         target_critics: int = 0,
+        target_noise: float = 0.2,
+        target_noise_clip: float = 0.5,
         noise: RunNoise | None = None,
         **kwargs: Any,
     ) -> None:
         super().__init__(*args, policy_noise=0.0, noise_clip=0.0, **kwargs)
         self.terms = terms
         self.target_critics = checked_subset(target_critics, self.num_qvalue_nets)
+        self.target_noise, self.target_noise_clip = target_noise, target_noise_clip
         self.noise = noise or RunNoise()
 
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
