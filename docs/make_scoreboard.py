@@ -82,14 +82,14 @@ def boards() -> dict[str, list[Curves]]:
     """Methods whose runs are known, by task."""
     return {
         "FetchPush": [
-            ours("default agent", "default agent"),
-            ours("default agent on FetchPush, seeds 105 to 109", "the same, seeds 105 to 109"),
+            ours("default agent on FetchPush", "default agent"),
+            ours("epsilon decays by 0.99 on FetchPush", "the same, `epsilon_decay=0.99`"),
             ours("default agent, one stage after the other", "the same, one stage after the other"),
             theirs("RHER", "FetchPush", "Relay-HER"),
             theirs("DDPG+HER", "FetchPush", "DDPG and HER, by Relay-HER's authors"),
         ],
         "FetchPickAndPlace": [
-            ours("default agent on FetchPickAndPlace", "default agent"),
+            ours("epsilon decays by 0.99 on FetchPickAndPlace", "default agent, `epsilon_decay=0.99`"),
             ours(
                 "default agent, one stage after the other, on FetchPickAndPlace",
                 "one stage after the other, seeds 0 to 2",
@@ -97,8 +97,10 @@ def boards() -> dict[str, list[Curves]]:
             theirs("RHER", "FetchPickAndPlace", "Relay-HER"),
             theirs("DDPG+HER", "FetchPickAndPlace", "DDPG and HER, by Relay-HER's authors"),
         ],
-        "PandaPush": [ours("default agent on PandaPush", "default agent")],
-        "PandaPickAndPlace": [ours("default agent on PandaPickAndPlace", "default agent")],
+        **{
+            task: [ours(f"default agent on {task}", "default agent, `epsilon_decay=0.99`")]
+            for task in ("PandaPush", "PandaPickAndPlace")
+        },
     }
 
 
@@ -164,7 +166,7 @@ if __name__ == "__main__":
     )
     cases = [
         read_curves("staying", {"case": case}, case, window=1, episodes=100)
-        for case in ("default agent", "default agent, one stage after the other")
+        for case in ("default agent on FetchPush", "default agent, one stage after the other")
     ]
     plot_comparison(
         {"FetchPush, at the last step": {curves.method: curves.rows for curves in cases}}, STAYING

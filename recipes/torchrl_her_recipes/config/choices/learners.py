@@ -116,7 +116,7 @@ class EpsilonConfig(LearnerConfig):
     has_epsilon: ClassVar[bool] = True
 
     epsilon_start: float = option(0.5, "share of exploring actions in the first epoch", at_least=0, at_most=1)
-    epsilon_decay: float = option(0.99, "factor of epsilon each epoch", above=0, at_most=1)
+    epsilon_decay: float = option(0.9, "factor of epsilon each epoch", above=0, at_most=1)
     epsilon_end: float = option(0.1, "lowest epsilon", at_least=0, at_most=1)
 
     def __post_init__(self) -> None:
