@@ -15,59 +15,7 @@ from torchrl.envs.utils import check_env_specs
 from torchrl_her_envs import GymGoalEnv, make_gym_env, reward_bounds, reward_range
 from torchrl_her_envs.common import goal_rules
 
-from .walk import Walk
-
-
-class Plain(Walk):
-    """A walk with nothing but compute_reward.
-
-    Args:
-        stops: whether a step at the goal terminates the episode.
-        tells: whether info has is_success.
-        far: how far goals are away: from 10 on, no random walk gets there.
-        falls: whether the episode terminates in place 0.
-        dense: whether the reward is the distance.
-        cost: of each step, which compute_reward does not know.
-    """
-
-    def __init__(
-        self,
-        *,
-        stops: bool = True,
-        tells: bool = True,
-        unseen: bool = False,
-        falls: bool = False,
-        dense: bool = False,
-        cost: float = 0.0,
-        form: str = "batch",
-        render_mode: str | None = None,
-    ) -> None:
-        super().__init__(without="compute_terminated", form=form, render_mode=render_mode)
-        self.stops, self.tells, self.falls, self.dense, self.unseen = stops, tells, falls, dense, unseen
-        self.cost = cost
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
-        super().reset(seed=seed)
-        if self.unseen:
-            self.goal = 9.0
-        if self.falls:
-            self.place, self.goal = 2.0, 4.0
-        return self._show(), {}
-
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        self.place = float(np.clip(self.place + (1 if np.ravel(action)[0] > 0 else -1), 0, 4))
-        met = self.place == self.goal
-        reward = self.compute_reward(np.array([self.place]), np.array([self.goal]), {})
-        ends = (self.stops and met) or (self.falls and self.place == 0)
-        return self._show(), float(reward) - self.cost, ends, False, {"is_success": met} if self.tells else {}
-
-    def compute_reward(self, achieved: np.ndarray, desired: np.ndarray, info: Any) -> Any:
-        if self.dense:
-            return -np.abs(achieved - desired).sum(-1)
-        return super().compute_reward(achieved, desired, info)
-
-
-gymnasium.register("tests/Plain-v0", Plain, max_episode_steps=6)
+from .walk import Plain
 
 
 @pytest.fixture
@@ -273,12 +221,6 @@ def test_the_achieved_reward_of_a_dense_one_is_found_if_the_environment_tells_su
 
 
 def test_rewards_of_steps_that_goals_do_not_explain_are_noticed(said: pytest.LogCaptureFixture) -> None:
-    class Costly(Plain):
-        def step(self, action: Any) -> Any:
-            shown, reward, *rest = super().step(action)
-            return shown, reward - 0.25, *rest
-
-    gymnasium.register("tests/Costly-v0", Costly, max_episode_steps=6)
-    make_gym_env("tests/Costly-v0")
+    plain(cost=0.25)
     pattern = "a step gave the reward -.*25, and compute_reward .* for the same"
     assert any(re.search(pattern, record.getMessage()) for record in said.records)

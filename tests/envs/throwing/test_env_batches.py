@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
@@ -291,38 +289,6 @@ def test_a_block_of_a_batch_of_several_seeds_is_that_seed_alone(name: str, num_e
         for key in ("state", ("next", "state"), ("next", "reward"), ("next", "done"), "achieved_goal"):
             pair = (together[key][part].double(), own[key].double())
             torch.testing.assert_close(*pair, rtol=0, atol=1e-9)
-
-
-@settings(max_examples=10, deadline=None)
-@given(
-    name=st.sampled_from(["hand_v0", "hand_wall_v1", "robot_v0"]),
-    seeds=st.lists(st.integers(0, 2**64 - 1), min_size=1, max_size=6),
-    size=st.integers(1, 4),
-    data=st.data(),
-)
-def test_an_environment_of_a_seed_does_the_same_in_every_batch(
-    name: str, seeds: list[int], size: int, data: st.DataObject
-) -> None:
-    block, own = data.draw(st.integers(0, len(seeds) - 1)), data.draw(st.integers(0, size - 1))
-    every = make_env(name, num_envs=size * len(seeds), seed=seeds, dtype=torch.float64)
-    alone = make_env(name, num_envs=own + 1, seed=seeds[block], dtype=torch.float64)
-    for env in (every, alone):
-        env.reset()
-        state = env.world_state_dict()  # balls that bounce: the same in all of them
-        state["ball"][:] = torch.tensor([1.0, 1.5])
-        state["ball_velocity"][:] = torch.tensor([5.0, -4.0])
-        state["free"].fill_(True)
-        for flag in ("held", "closed"):
-            state[flag].fill_(False)
-        env.load_world_state_dict(state)
-    place = block * size + own
-    actions = random_actions(every, 60, seed=data.draw(st.integers(0, 99)))
-    actions[:, place, -1] = -1.0
-    path = follow(every, actions)[:, place]
-    assert bounces(path) > 0
-    mine = actions[:, :1].expand(-1, own + 1, -1).clone()
-    mine[:, own] = actions[:, place]
-    torch.testing.assert_close(path, follow(alone, mine)[:, own], rtol=0, atol=1e-9)
 
 
 def test_all_seeds_share_one_space() -> None:

@@ -15,6 +15,8 @@ from torchrl_her_recipes import build, make_recipe
 from torchrl_her_recipes.components.envs import TaskEnvs
 from torchrl_her_recipes.runs.evaluation import measure
 
+from ...envs.gym.walk import Plain
+
 TASK = "gym:tests/Cliff-v0"
 GAMMA = 0.9
 WORTH = -10.0  # -1 / (1 - GAMMA)
@@ -31,8 +33,8 @@ OPTIONS: dict[str, Any] = {
 }
 
 
-class Cliff(gymnasium.Env):
-    """A walk in places 0 to 4 from place 2 to goal 4; in place 0 it falls, where goal and cliff are apart.
+class Cliff(Plain):
+    """A walk from place 2 to goal 4; in place 0 it falls, where goal and cliff are apart.
 
     Args:
         crash: the reward of a fall.
@@ -40,28 +42,16 @@ class Cliff(gymnasium.Env):
     """
 
     def __init__(self, *, crash: float = -1.0, stops: bool = True) -> None:
-        line = spaces.Box(-np.inf, np.inf, (1,), np.float32)
-        self.observation_space = spaces.Dict(observation=line, achieved_goal=line, desired_goal=line)
+        super().__init__(falls=True, stops=stops)
         self.action_space = spaces.Box(-2.0, 2.0, (1,), np.float32)
-        self.crash, self.stops = crash, stops
-
-    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, Any]:
-        super().reset(seed=seed)
-        self.place = 2.0
-        return self._show(), {}
+        self.crash = crash
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        self.place += 1.0 if action[0] > 0 else -1.0
-        fell, met = self.place == 0.0, self.place == 4.0
-        reward = self.crash if fell else float(met) - 1.0
-        return self._show(), reward, fell or (self.stops and met), False, {"is_success": met}
+        shown, reward, *rest = super().step(action)
+        return shown, self.crash if self.place == 0.0 else reward, *rest
 
     def compute_reward(self, achieved: np.ndarray, desired: np.ndarray, info: Any) -> Any:
         return (np.abs(achieved - desired)[..., 0] < 0.5) - 1.0
-
-    def _show(self) -> dict[str, np.ndarray]:
-        values = {"observation": self.place, "achieved_goal": self.place, "desired_goal": 4.0}
-        return {key: np.array([value], np.float32) for key, value in values.items()}
 
 
 gymnasium.register("tests/Cliff-v0", Cliff, max_episode_steps=12)

@@ -160,24 +160,6 @@ def test_training_goes_on_in_two_stages_at_once() -> None:
     assert torch.isfinite(weights(components)).all()
 
 
-def test_a_run_that_was_stopped_after_a_change_goes_on_as_if_it_had_not(tmp_path: Path) -> None:
-    # a threshold that any success meets: the reach ends after the first epoch
-    recipe = climbing(success_threshold=0.01, episodes=30, window=30, epochs=4, seed=4)
-    whole = build(recipe)
-    run(whole, tmp_path / "whole", progress=False)
-    stages = pd.read_csv(tmp_path / "whole" / "metrics.csv")["stage"].tolist()
-    assert stages[0] == 0
-    assert stages[-1] == 1
-    changed = stages.index(1)
-    run(build(recipe.replace(epochs=changed + 1)), tmp_path / "part", progress=False)
-    config = (tmp_path / "part" / "config.yaml").read_text()
-    (tmp_path / "part" / "config.yaml").write_text(config.replace(f"epochs: {changed + 1}", "epochs: 4"))
-    part = build(recipe)
-    resume(tmp_path / "part", components=part, progress=False)
-    assert torch.equal(weights(part), weights(whole))
-    assert part.curriculum.progress.stages == (1,)
-
-
 def test_runs_are_guided_by_the_stage_that_they_have_learned() -> None:
     components = build(climbing(num_runs=2, guided_share=1.0, epsilon_start=0.0, epsilon_end=0.0))
     guide = components.guide

@@ -215,23 +215,6 @@ def test_environments_that_cannot_be_saved_go_on_bit_for_bit_between_epochs(
     assert_same_runs(tmp_path / "whole", tmp_path / "part")
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"task": "robot_v2", "num_runs": 2},
-        pytest.param({"task": "hand_wall_v2"}, marks=pytest.mark.full),
-        pytest.param({"sampler": "uniform"}, marks=pytest.mark.full),
-    ],
-)
-def test_a_finished_run_that_is_given_more_epochs(options: dict[str, Any], tmp_path: Path) -> None:
-    recipe = small(epochs=4, checkpoint_interval=2, **options)
-    run(build(recipe), tmp_path / "whole", progress=False)
-    run(build(recipe.replace(epochs=2)), tmp_path / "part", progress=False)
-    (tmp_path / "part" / "config.yaml").write_text((tmp_path / "whole" / "config.yaml").read_text())
-    assert len(resume(tmp_path / "part", progress=False).rows) == 4 * recipe.run.num_runs
-    assert_same_runs(tmp_path / "whole", tmp_path / "part")
-
-
 def test_epochs_extend_a_finished_run_and_an_interrupted_one(
     ended: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

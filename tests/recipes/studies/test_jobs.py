@@ -25,12 +25,12 @@ from torchrl_her_recipes.studies.jobs import (
 
 from ..small import small
 
-HEAD = "run,epoch,seconds"
+RECIPE = small(task="hand_v0", algo="her", epoch_frames=160)
 
 
 @pytest.fixture
 def job(tmp_path: Path) -> Job:
-    return Job(label="her", recipe=small(task="hand_v0", algo="her"), folder=tmp_path / "her")
+    return Job(label="her", recipe=RECIPE, folder=tmp_path / "her")
 
 
 def test_a_job_without_a_checkpoint_begins_again(job: Job) -> None:
@@ -66,7 +66,7 @@ def test_a_job_that_was_killed_before_its_configuration_was_written_begins_again
 
 
 def test_a_job_that_was_killed_while_it_drew_its_pictures_draws_them(job: Job) -> None:
-    job = replace(job, recipe=small(task="hand_v0", algo="her", pictures=True))
+    job = replace(job, recipe=RECIPE.replace(pictures=True))
     assert run_job(job) == Outcome()
     assert kept_progress(job).epochs == 2
     (job.folder / "policy.safetensors").unlink()
@@ -128,7 +128,7 @@ def test_a_folder_arrives_as_it_was_sent_in_place_of_what_was_there(tmp_path: Pa
 
 
 def test_a_job_goes_on_in_a_folder_that_has_travelled(job: Job, tmp_path: Path) -> None:
-    assert run_job(replace(job, recipe=small(task="hand_v0", algo="her", epochs=1))) == Outcome()
+    assert run_job(replace(job, recipe=RECIPE.replace(epochs=1))) == Outcome()
     config = job.folder / "config.yaml"
     config.write_text(config.read_text().replace("epochs: 1", "epochs: 2"))
     there = replace(job, folder=tmp_path / "elsewhere")
@@ -146,7 +146,7 @@ def _stop_after(*, frames: int, told: str) -> Iterator[list[Callback]]:
 
 def test_what_surrounds_a_run_travels_with_its_job_and_gives_it_callbacks(job: Job) -> None:
     told = job.folder.with_name("told")
-    own = replace(job, around=f"{__name__}:_stop_after", options={"frames": 480, "told": str(told)})
+    own = replace(job, around=f"{__name__}:_stop_after", options={"frames": 160, "told": str(told)})
     assert Job.from_plain(own.to_plain()) == own
     assert run_job(own) == Outcome()
     assert read_progress(job.folder).epochs == 1  # of two

@@ -27,7 +27,7 @@ pytestmark = pytest.mark.skipif(
 )
 STUDY = Study(
     name="killed",
-    recipe={**SMALL, "task": "hand_v1", "epochs": 2, "window": 10},
+    recipe={**SMALL, "task": "hand_v1", "epoch_frames": 240, "warmup_frames": 160, "window": 10},
     vary={"algo": ["cher_ibs", "her", "filtered_her"]},
 )
 FILES = ("config.yaml", "goal_map.npz", "killed.png")

@@ -12,13 +12,6 @@ from torchrl_her_envs.throwing.experts.arm import ArmSkill
 WORLD = WorldConfig()
 
 
-def test_speeds_of_a_throw_are_within_the_arm_s() -> None:
-    joints, goal = torch.tensor([[1.6, 0.0]]), torch.tensor([[5.0, 4.0]])
-    velocity = ArmSkill(WORLD).throw(joints, goal, within=0.2)
-    assert velocity.abs().max() <= WORLD.joint_speed
-    assert velocity[0, 0] < 0  # clockwise, to the right
-
-
 def test_an_arm_that_cannot_throw_gets_ready() -> None:
     hanging, goal = torch.tensor([[-math.pi / 2, 0.0]]), torch.tensor([[5.0, 4.9]])
     impossible = ArmSkill(WORLD).throw(hanging, goal, within=1e-6)
