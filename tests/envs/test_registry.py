@@ -95,8 +95,6 @@ def test_names_and_options_are_there_without_torch() -> None:
         "import torchrl_her_envs.gym.quiet\n"  # in each process of an environment of gymnasium's
         "loaded = {'torch', 'tensordict', 'torchrl', 'pymunk', 'matplotlib'} & set(sys.modules)\n"
         "assert not loaded, loaded\n"
-        "assert torchrl_her_envs.make_env('chain').max_steps == 10\n"
-        "assert 'torch' in sys.modules\n"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
 
