@@ -132,7 +132,7 @@ def test_a_change_of_stage_empties_and_restarts_one_run_alone() -> None:
     lines = move(components, run=1)
     assert lines == ["seed 1: 'reach' learned after 1,600 frames, 'throw' begins"]
     assert [size > 0 for size in sizes_of(components.buffer)] == [True, False]
-    assert components.exploration.epsilon.tolist() == pytest.approx([0.98, 1.0], abs=1e-3)
+    assert components.exploration.epsilon.tolist() == pytest.approx([0.81, 1.0], abs=1e-3)
     writer = components.buffer.writer
     assert writer.counts_of(0).real > 0
     assert writer.counts_of(1).real == 0
