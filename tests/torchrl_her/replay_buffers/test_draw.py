@@ -95,10 +95,10 @@ def test_each_run_draws_with_its_own_weights_and_filter() -> None:
     def draw(*generators: torch.Generator, k: int = 3, **changes: object) -> tuple[list[int], list[int]]:
         options = HindsightOptions(k=k, filter_achieved=True).changed(changes)
         chunk = Chunk(rows, None, piece, GoalReward(1.5), options, options.transition_keys())
-        out = draw_for_runs(chunk, weights=weights, generators=generators, recent=RecentGoals.none(6))
-        return out.source.tolist(), [
-            int(goal) - 1 for goal in out.goals
-        ]  # goal i + 1 was achieved by transition i
+        source, goals, _ = draw_for_runs(
+            chunk, weights=weights, generators=generators, recent=RecentGoals.none(6)
+        )
+        return source.tolist(), [int(goal) - 1 for goal in goals]  # goal i + 1 was achieved by transition i
 
     seeded = [torch.Generator().manual_seed(seed) for seed in (0, 1)]
     source, goal = draw(*seeded)
