@@ -89,7 +89,8 @@ def boards() -> dict[str, list[Curves]]:
             theirs("DDPG+HER", "FetchPush", "DDPG and HER, by Relay-HER's authors"),
         ],
         "FetchPickAndPlace": [
-            ours("epsilon decays by 0.99 on FetchPickAndPlace", "default agent, `epsilon_decay=0.99`"),
+            ours("default agent on FetchPickAndPlace", "default agent"),
+            ours("epsilon decays by 0.99 on FetchPickAndPlace", "the same, `epsilon_decay=0.99`"),
             ours(
                 "default agent, one stage after the other, on FetchPickAndPlace",
                 "one stage after the other, seeds 0 to 2",
