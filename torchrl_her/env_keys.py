@@ -6,6 +6,9 @@ from dataclasses import dataclass
 
 from tensordict import NestedKey
 
+# Flags that BehaviorGoals writes: the goal was proposed; a proposed goal was achieved in the episode.
+PROPOSED, PROPOSED_REACHED = "proposed", "proposed_reached"
+
 
 @dataclass(frozen=True, kw_only=True)
 class EnvKeys:

@@ -14,7 +14,7 @@ from torchrl.envs import Transform
 from torchrl_her.behavior.factors import GoalCandidates, GoalFactor
 from torchrl_her.behavior.memory import AchievedGoals
 from torchrl_her.checks import check_whole, entry_of
-from torchrl_her.env_keys import EnvKeys
+from torchrl_her.env_keys import PROPOSED, PROPOSED_REACHED, EnvKeys
 from torchrl_her.goals.factors import draw
 from torchrl_her.goals.instructive import InstructiveWeights
 from torchrl_her.goals.rewards import RewardFunction, call_reward, outcomes
@@ -131,7 +131,7 @@ class BehaviorGoals(Transform):
         run_weights = weights_by_run(weights, runs)
         keys.check_ends(continues_after_termination=continues_after_termination)
         in_keys = [keys.observation, keys.achieved_goal, keys.desired_goal]
-        out_keys = [keys.desired_goal, real_goal_key, "proposed", "proposed_reached"]
+        out_keys = [keys.desired_goal, real_goal_key, PROPOSED, PROPOSED_REACHED]
         super().__init__(in_keys=in_keys, out_keys=out_keys)
         self.generators: Generators = check_generators(runs, generators) or [None]
         self.reward_fn, self.weights, self.factors = reward_fn, run_weights, list(factors)

@@ -14,7 +14,7 @@ from torchrl.envs import Transform
 from torchrl_her.checks import check_blocks, entry_of
 from torchrl_her.curriculum.orders import EpisodeStages
 from torchrl_her.curriculum.stages import Curriculum, CurriculumProgress
-from torchrl_her.env_keys import EnvKeys
+from torchrl_her.env_keys import PROPOSED, EnvKeys
 from torchrl_her.goals.rewards import RewardFunction, is_achieved
 from torchrl_her.replay_buffers.keys import device_of
 
@@ -342,7 +342,7 @@ class StageOutcomes(Transform):
         self.reward_fn, self.achieved_reward, self.keys = reward_fn, achieved_reward, keys
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        done, proposed = next_tensordict.get(self.keys.done), tensordict.get("proposed", None)
+        done, proposed = next_tensordict.get(self.keys.done), tensordict.get(PROPOSED, None)
         ended = done if proposed is None else done & ~proposed
         if bool(ended.any()):
             stage, runs = tensordict.get(self.stage_key), self.progress.runs

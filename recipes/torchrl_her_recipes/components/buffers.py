@@ -16,6 +16,7 @@ from torchrl_her.curriculum.normalization import count_inputs
 from torchrl_her.curriculum.switch import set_stage_goals
 from torchrl_her.curriculum.transforms import ZeroPad
 from torchrl_her.curriculum.view import StageView
+from torchrl_her.env_keys import PROPOSED, PROPOSED_REACHED
 from torchrl_her.goals.rewards import RewardFunction
 from torchrl_her.modules.normalization import RunningNorm
 from torchrl_her.modules.normalized import NormalizeBatch
@@ -41,8 +42,8 @@ _NOT_STORED = (
     "is_success",
     "info",
     "collector",
-    "proposed",
-    "proposed_reached",
+    PROPOSED,
+    PROPOSED_REACHED,
 )
 
 
