@@ -72,7 +72,7 @@ nitpick_ignore_regex = [
     ("py:class", r"torchrl_her_recipes\.components\.(curricula\.CurriculumState|learner\.AgentShape)"),
     ("py:class", r"torchrl_her_recipes\.reports\.tidy\.Results"),
     ("py:class", r"torchrl_her_recipes\.components\.demonstrations\.RunDemonstrations"),
-    ("py:class", r"torchrl_her_recipes\.studies\.(workers_local\.Workers|study\.StudyResult|plan\.Plan)"),
+    ("py:class", r"torchrl_her_recipes\.studies\.(workers\.Workers|study\.StudyResult|plan\.Plan)"),
 ]
 
 html_theme = "furo"

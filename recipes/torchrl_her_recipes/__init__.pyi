@@ -47,7 +47,7 @@ from .runs.callbacks import RunView as RunView
 from .runs.check import advice as advice
 from .runs.folder import RunFolder as RunFolder
 from .runs.loggers.log_to import LogTo as LogTo
-from .runs.loggers.show import show_file as show_file
+from .runs.loggers.log_to import show_file as show_file
 from .runs.run import RunResult as RunResult
 from .runs.run import resume as resume
 from .runs.run import run as run

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from functools import partial
 from typing import Any
@@ -20,6 +21,7 @@ from torchrl_her.env_keys import PROPOSED, PROPOSED_REACHED
 from torchrl_her.goals.rewards import RewardFunction
 from torchrl_her.modules.normalization import RunningNorm
 from torchrl_her.modules.normalized import NormalizeBatch
+from torchrl_her.replay_buffers.keys import in_root_and_next
 from torchrl_her.replay_buffers.runs import PackedStorage, RunsPrioritizedSampler, RunsSampler
 from torchrl_her.replay_buffers.stage_rules import StageRule
 from torchrl_her.replay_buffers.writer import HERWriter
@@ -28,7 +30,6 @@ from torchrl_her_recipes.components.curricula import CurriculumState
 from torchrl_her_recipes.components.devices import ON_THE_CPU, Devices
 from torchrl_her_recipes.components.envs import task_reward
 from torchrl_her_recipes.components.goals.space import GoalSpace, KernelSpace
-from torchrl_her_recipes.components.memory import check_buffer_size
 from torchrl_her_recipes.config.groups import HindsightConfig, ReplayConfig
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.config.values import load_name
@@ -171,3 +172,26 @@ def _make_sampler(
         generators=generators,
         device=device,
     )
+
+
+def check_buffer_size(
+    size: int, runs: int, env: EnvBase, device: torch.device, *, not_stored: Sequence[str] = ()
+) -> None:
+    """Refuses a replay buffer that is larger than the memory of its device."""
+    step = env.fake_tensordict().exclude(*in_root_and_next(not_stored))
+    row = sum(entry.numel() * entry.element_size() for entry in step.values(True, True)) // env.numel()
+    capacity = memory_of(device)
+    if size * runs * row > capacity:
+        raise ValueError(
+            f"buffer_size={size} needs {size * runs * row / 1e9:.0f} GB for num_runs={runs}, {row} bytes for "
+            f"each transition, but {device} has {capacity / 1e9:.0f} GB"
+        )
+
+
+def memory_of(device: torch.device) -> float:
+    """Returns the bytes of memory of a device; infinity if the number is unknown."""
+    if device.type == "cuda" and torch.cuda.device_count():
+        return float(torch.cuda.get_device_properties(device).total_memory)
+    if device.type != "cpu" or not hasattr(os, "sysconf"):
+        return torch.inf
+    return float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))

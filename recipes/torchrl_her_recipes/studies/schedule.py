@@ -12,7 +12,7 @@ from tqdm import tqdm
 from torchrl_her_recipes.runs.interrupt import Interrupted, soft_interrupt
 from torchrl_her_recipes.studies.jobs import Job, Outcome, kept_progress
 from torchrl_her_recipes.studies.plan import Plan
-from torchrl_her_recipes.studies.workers_local import Workers
+from torchrl_her_recipes.studies.workers import Workers
 
 _TICK = 1.0  # seconds between two updates of the progress
 _BAR = "{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} steps [{elapsed}{postfix}]"

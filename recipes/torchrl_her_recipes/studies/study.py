@@ -22,7 +22,7 @@ from torchrl_her_recipes.studies.jobs import Job
 from torchrl_her_recipes.studies.plan import Plan
 from torchrl_her_recipes.studies.schedule import run_jobs
 from torchrl_her_recipes.studies.seed_batches import Batches, plan_batches
-from torchrl_her_recipes.studies.workers_local import LocalWorkers, Workers
+from torchrl_her_recipes.studies.workers import LocalWorkers, Workers
 
 _NOTE = "sweep.json"  # file that lists the single runs of a folder
 

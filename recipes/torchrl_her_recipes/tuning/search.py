@@ -33,7 +33,7 @@ from torchrl_her_recipes.runs.interrupt import Interrupted, soft_interrupt
 from torchrl_her_recipes.runs.scores import score
 from torchrl_her_recipes.studies.jobs import Job, Outcome
 from torchrl_her_recipes.studies.schedule import outcome_of
-from torchrl_her_recipes.studies.workers_local import LocalWorkers, Workers
+from torchrl_her_recipes.studies.workers import LocalWorkers, Workers
 from torchrl_her_recipes.tuning.results import DEFAULT, folder_of, write_pictures, write_results
 
 _NAME, _SETTINGS, _DATABASE = "search", "search.yaml", "search.db"

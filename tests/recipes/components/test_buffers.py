@@ -7,9 +7,12 @@ import math
 import pytest
 import torch
 
-from torchrl_her_recipes import build, look_at
+from torchrl_her_recipes import build, look_at, make_recipe
+from torchrl_her_recipes.components import buffers
 
 from ..small import small
+
+SMALL = {"task": "hand_v0", "num_envs": 2, "steps_per_batch": 2, "pictures": False}
 
 
 @pytest.mark.parametrize("learner", ["ddpg", "td3", "sac", "redq", "tqc"])
@@ -80,3 +83,24 @@ def test_virtual_transitions_of_a_recipe_get_the_info_of_their_own_step() -> Non
     torch.testing.assert_close(after["reward"], -far.float() - rows["action"].abs() / 4)
     assert "info" not in rows.keys()
     components.close()
+
+
+def test_sizes_beyond_memory_are_refused_by_name() -> None:
+    # 9 + 2 numbers and 3 flags before and after the action, 3 of the action, and a reward
+    message = "buffer_size=1000000000000 needs 220000 GB for num_runs=2, 110 bytes for each transition, but"
+    with pytest.raises(ValueError, match=message):
+        build(make_recipe(**SMALL, buffer_size=10**12, num_runs=2))
+
+
+def test_a_buffer_that_just_fits_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
+    recipe = make_recipe(**SMALL, buffer_size=1_000, batch_size=16)
+    monkeypatch.setattr(buffers, "memory_of", lambda device: 110_000.0)
+    assert build(recipe).buffer.storage.max_size == 1_000
+    monkeypatch.setattr(buffers, "memory_of", lambda device: 109_999.0)
+    with pytest.raises(ValueError, match="buffer_size=1000 needs 0 GB"):
+        build(recipe)
+
+
+def test_limits_that_limit_nothing_may_be_infinite() -> None:
+    recipe = make_recipe(**SMALL, max_grad_norm=math.inf, normalize=True, normalize_clip=math.inf)
+    assert build(recipe).recipe.learner.max_grad_norm == torch.inf

@@ -13,7 +13,7 @@ from torchrl_her_recipes import LEARNERS, cli
 from torchrl_her_recipes.config import imports
 from torchrl_her_recipes.config.imports import import_modules, imported_modules
 from torchrl_her_recipes.studies.jobs import Job, Outcome
-from torchrl_her_recipes.studies.workers_local import LocalWorkers
+from torchrl_her_recipes.studies.workers import LocalWorkers
 
 from ..small import overrides, small
 from ..studies.forked_worker import fork_workers

@@ -11,14 +11,14 @@ from typing import Any
 
 import pytest
 
-from torchrl_her_recipes.studies import worker_main, workers_local
+from torchrl_her_recipes.studies import worker_main, workers
 
 from ...forks import fork
 
 
 def fork_workers(patch: pytest.MonkeyPatch) -> None:
     """Lets :class:`LocalWorkers` fork its processes: new ones would take seconds to import torch."""
-    patch.setattr(workers_local, "subprocess", SimpleNamespace(Popen=_Forked, PIPE=None))
+    patch.setattr(workers, "subprocess", SimpleNamespace(Popen=_Forked, PIPE=None))
 
 
 class _Forked:

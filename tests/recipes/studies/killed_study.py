@@ -16,9 +16,9 @@ from typing import Any, Literal, NoReturn
 import pytest
 
 from torchrl_her_recipes.config.study import Study
-from torchrl_her_recipes.studies import workers_local
+from torchrl_her_recipes.studies import workers
 from torchrl_her_recipes.studies.study import StudyResult, run_study
-from torchrl_her_recipes.studies.workers_local import LocalWorkers
+from torchrl_her_recipes.studies.workers import LocalWorkers
 
 from ...forks import fork
 from .forked_worker import serve
@@ -91,7 +91,7 @@ def _run(study: Study, folder: Path, writer: Connection) -> None:
         return own
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(workers_local.subprocess, "Popen", next_fork)
+        patch.setattr(workers.subprocess, "Popen", next_fork)
         result = run_study(study, folder, workers=LocalWorkers(_AT_ONCE), progress=False)
     writer.send(result)
 

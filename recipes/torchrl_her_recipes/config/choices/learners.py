@@ -155,7 +155,7 @@ class DDPGConfig(NoiseConfig):
     """Deterministic policy gradients (Lillicrap et al., 2016)."""
 
     name = "ddpg"
-    maker = f"{_MAKERS}.ddpg:DDPGBuilder"
+    maker = f"{_MAKERS}:DDPGBuilder"
     clones: ClassVar[bool] = True
 
     norm: str = _norm("batch", text=": layer, in all networks; batch, in the critic, and of its input")
@@ -183,7 +183,7 @@ class TD3Config(_SomeCritics, DDPGConfig):
     """Two critics and smoothed targets (Fujimoto et al., 2018)."""
 
     name = "td3"
-    maker = f"{_MAKERS}.td3:TD3Builder"
+    maker = f"{_MAKERS}:TD3Builder"
 
     norm: str = _norm()
 
@@ -210,7 +210,7 @@ class SACConfig(_SomeCritics, EntropyConfig):
     """Soft actor-critic with a learned temperature (Haarnoja et al., 2018)."""
 
     name = "sac"
-    maker = f"{_MAKERS}.sac:SACBuilder"
+    maker = f"{_MAKERS}:SACBuilder"
 
 
 @LEARNERS.register
@@ -230,7 +230,7 @@ class TQCConfig(EntropyConfig):
     """SAC whose critics give quantiles, the greatest left out (Kuznetsov et al., 2020)."""
 
     name = "tqc"
-    maker = f"{_MAKERS}.tqc:TQCBuilder"
+    maker = f"{_MAKERS}:TQCBuilder"
 
     critics: int = option(2, "how many critics there are; targets have all of their quantiles", at_least=1)
     quantiles: int = option(25, "quantiles of the return that each critic gives", at_least=1)
@@ -252,7 +252,7 @@ class DQNConfig(EpsilonConfig):
     """Double DQN, for discrete actions (van Hasselt et al., 2016)."""
 
     name = "dqn"
-    maker = f"{_MAKERS}.dqn:DQNBuilder"
+    maker = f"{_MAKERS}:DQNBuilder"
     actions = "discrete"
 
     clamp_targets: bool = option(True, _CLAMPED)

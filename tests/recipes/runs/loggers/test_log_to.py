@@ -19,7 +19,7 @@ from torchrl_her_recipes.config import loggers as known
 from torchrl_her_recipes.config.loggers import LoggerSpec, check_installed, register_logger
 from torchrl_her_recipes.config.recipe import make_recipe
 from torchrl_her_recipes.runs.loggers import log_to
-from torchrl_her_recipes.runs.loggers.show import read_film
+from torchrl_her_recipes.runs.loggers.log_to import read_film
 
 from ....forks import fork
 from ...small import small

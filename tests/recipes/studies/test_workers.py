@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from torchrl_her_recipes.studies.jobs import Job, Outcome, Progress, can_resume
-from torchrl_her_recipes.studies.workers_local import LocalWorkers
+from torchrl_her_recipes.studies.workers import LocalWorkers
 
 from ..small import small
 from .forked_worker import fork_workers
