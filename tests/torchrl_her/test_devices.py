@@ -66,7 +66,7 @@ from torchrl_her.objectives import (
     make_td3_loss,
     make_tqc_loss,
 )
-from torchrl_her.replay_buffers.runs import PackedStorage, RunsPrioritizedSampler, RunsSampler, empty_run
+from torchrl_her.replay_buffers import PackedStorage, RunsPrioritizedSampler, RunsSampler, empty_run
 from torchrl_her.trainers import buffer_state_dict, load_buffer_state_dict
 from torchrl_her.trainers.metrics import discounted_return, final_distance
 

@@ -6,16 +6,10 @@ from torchrl_her.replay_buffers.episode_index import EpisodeIndex, index_episode
 from torchrl_her.replay_buffers.episodes import Episodes, find_episodes
 from torchrl_her.replay_buffers.keys import TransitionKeys
 from torchrl_her.replay_buffers.options import HindsightBase, HindsightOptions
-from torchrl_her.replay_buffers.runs import (
-    PackedStorage,
-    RunsPrioritizedSampler,
-    RunsSampler,
-    empty_run,
-    rows_of_run,
-    runs_of,
-    sizes_of,
-)
+from torchrl_her.replay_buffers.runs.buffer import empty_run, rows_of_run, runs_of, sizes_of
 from torchrl_her.replay_buffers.runs.counts import WriterCounts
+from torchrl_her.replay_buffers.runs.sampler import RunsPrioritizedSampler, RunsSampler
+from torchrl_her.replay_buffers.runs.storage import PackedStorage
 from torchrl_her.replay_buffers.sample_unit import HERSampleUnit
 from torchrl_her.replay_buffers.stage_rules import StageRule
 from torchrl_her.replay_buffers.writer import HERWriter

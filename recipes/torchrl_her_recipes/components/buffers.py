@@ -21,8 +21,8 @@ from torchrl_her.env_keys import PROPOSED, PROPOSED_REACHED
 from torchrl_her.goals.rewards import RewardFunction
 from torchrl_her.modules.normalization import RunningNorm
 from torchrl_her.modules.normalized import NormalizeBatch
+from torchrl_her.replay_buffers import PackedStorage, RunsPrioritizedSampler, RunsSampler
 from torchrl_her.replay_buffers.keys import in_root_and_next
-from torchrl_her.replay_buffers.runs import PackedStorage, RunsPrioritizedSampler, RunsSampler
 from torchrl_her.replay_buffers.stage_rules import StageRule
 from torchrl_her.replay_buffers.writer import HERWriter
 from torchrl_her_envs.common.goal_env import goal_env, reward_range

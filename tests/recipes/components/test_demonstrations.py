@@ -11,7 +11,7 @@ import torch
 from tensordict.nn import TensorDictModule
 
 from torchrl_her.demonstrations import Demonstrations, MixedReplay, demonstrate
-from torchrl_her.replay_buffers.runs import rows_of_run, sizes_of
+from torchrl_her.replay_buffers import rows_of_run, sizes_of
 from torchrl_her.trainers import FusedLearner, LossLearner
 from torchrl_her_envs import make_env
 from torchrl_her_recipes import Components, build, record_demonstrations, run

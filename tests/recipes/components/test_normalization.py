@@ -9,7 +9,7 @@ import torch
 
 from torchrl_her.modules import NormalizedPolicy, RunningNorm, take_run
 from torchrl_her.objectives import critic_value
-from torchrl_her.replay_buffers.runs import rows_of_run
+from torchrl_her.replay_buffers import rows_of_run
 from torchrl_her_recipes import Components, build, make_recipe, run
 from torchrl_her_recipes.runs.curriculum import move_on, play_greedily
 from torchrl_her_recipes.runs.evaluation import measure

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchrl_her.modules import take_run
-from torchrl_her.replay_buffers.runs import rows_of_run
+from torchrl_her.replay_buffers import rows_of_run
 from torchrl_her.replay_buffers.runs.buffer import empty_run, sizes_of
 from torchrl_her_recipes import Callback, Components, Recipe, RunView, build, run
 

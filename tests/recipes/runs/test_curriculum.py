@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 from torchrl_her import Instructiveness, enter_stage
-from torchrl_her.replay_buffers.runs import sizes_of
+from torchrl_her.replay_buffers import sizes_of
 from torchrl_her_envs import TASKS, base_env, make_env
 from torchrl_her_recipes import Components, Recipe, build, resume, run
 from torchrl_her_recipes.cli import main

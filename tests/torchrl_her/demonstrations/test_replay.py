@@ -12,7 +12,7 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 from torchrl_her import GoalReward, HERWriter
 from torchrl_her.demonstrations import MixedReplay, demonstration_rows, write_demonstrations
-from torchrl_her.replay_buffers.runs import (
+from torchrl_her.replay_buffers import (
     PackedStorage,
     RunsPrioritizedSampler,
     RunsSampler,

@@ -16,7 +16,7 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl_her import GoalReward, GoalWeights, HERSampleUnit, HERWriter
 from torchrl_her.goals import NetworkNovelty, RareGoals
 from torchrl_her.goals.weights import spread_evenly
-from torchrl_her.replay_buffers.runs import RunsSampler
+from torchrl_her.replay_buffers import RunsSampler
 from torchrl_her.trainers import load_checkpoint, save_checkpoint
 
 from ..her_data import make_batch, make_buffer, virtual_goals

@@ -22,7 +22,7 @@ from torchrl_her.modules import (
     make_q_actor,
     make_stochastic_actor,
 )
-from torchrl_her.replay_buffers.runs import PackedStorage, RunsPrioritizedSampler, rows_of_run
+from torchrl_her.replay_buffers import PackedStorage, RunsPrioritizedSampler, rows_of_run
 from torchrl_her_envs import make_env
 
 from ..her_data import WANTED, make_batch

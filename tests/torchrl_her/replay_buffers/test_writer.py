@@ -24,7 +24,7 @@ from torchrl.data.replay_buffers.sample_units import Sequence
 from torchrl.data.replay_buffers.samplers import PrioritizedSampler, RandomSampler, SliceSampler
 
 from torchrl_her import EnvReward, GoalReward, GoalWeights, HERWriter
-from torchrl_her.replay_buffers.runs import RunsSampler
+from torchrl_her.replay_buffers import RunsSampler
 
 from ..her_data import WANTED, PreferFar, along, costly, make_batch, pairs, tag, tags
 

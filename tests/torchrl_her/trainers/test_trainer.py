@@ -31,7 +31,7 @@ from torchrl_her import (
 )
 from torchrl_her.modules import NetworkShape
 from torchrl_her.objectives import PenalizedDDPGLoss, Targets
-from torchrl_her.replay_buffers.runs import PackedStorage, RunsPrioritizedSampler, empty_run
+from torchrl_her.replay_buffers import PackedStorage, RunsPrioritizedSampler, empty_run
 from torchrl_her.trainers import RunsAdam
 
 N, STEPS = 8, 10

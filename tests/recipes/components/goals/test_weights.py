@@ -13,7 +13,7 @@ import torch
 
 from torchrl_her import Instructiveness
 from torchrl_her.goals import KernelInstructiveness, NetworkNovelty, RareGoals
-from torchrl_her.replay_buffers.runs import rows_of_run
+from torchrl_her.replay_buffers import rows_of_run
 from torchrl_her_envs import make_env
 from torchrl_her_recipes import Components, Recipe, build, resume, run
 from torchrl_her_recipes.components.envs import TaskEnvs

@@ -16,7 +16,7 @@ from torchrl.data.replay_buffers.samplers import RandomSampler
 
 from torchrl_her import GoalGrid, GoalReward, GoalWeights, HERWriter, Instructiveness
 from torchrl_her.goals import GoalHistogram, KernelInstructiveness, NetworkNovelty, RareGoals
-from torchrl_her.replay_buffers.runs import (
+from torchrl_her.replay_buffers import (
     PackedStorage,
     RunsPrioritizedSampler,
     RunsSampler,

@@ -12,7 +12,7 @@ from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, ReplayBuffer, TensorDictReplayBuffer
 from torchrl.data.replay_buffers.samplers import PrioritizedSampler
 
-from torchrl_her.replay_buffers.runs import RunsPrioritizedSampler, RunsSampler
+from torchrl_her.replay_buffers import RunsPrioritizedSampler, RunsSampler
 from torchrl_her.trainers.checkpoint import load_sampler_state_dict, sampler_state_dict
 
 RUNS, CAPACITY = 3, 40

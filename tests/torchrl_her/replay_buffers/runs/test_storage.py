@@ -15,7 +15,7 @@ import torch
 from tensordict import NonTensorData, TensorDict, TensorDictBase
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
-from torchrl_her.replay_buffers.runs import PackedStorage
+from torchrl_her.replay_buffers import PackedStorage
 from torchrl_her.replay_buffers.runs.storage import Move, layout, unpack, write_slices
 
 from ....forks import result_of
