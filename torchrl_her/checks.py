@@ -1,4 +1,4 @@
-"""Checks: options that must be whole numbers, finite tensors, equal blocks of runs, required entries."""
+"""Functions that check options, tensors and batches, and raise errors that name what is wrong."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ def check_whole(*, least: int = 1, **options: object) -> None:
 def check_finite(tensors: Mapping[str, Tensor]) -> None:
     """Raises an error for tensors that hold NaN or infinity.
 
-    The sum of a tensor shows NaN and infinity in a twentieth of the time of ``isfinite``. As sums of finite
-    numbers may overflow, ``isfinite`` decides where a sum is not finite.
+    A sum reveals NaN and infinity in a twentieth of the time of ``isfinite``. Since a sum of finite numbers
+    may overflow, ``isfinite`` decides if the sum is not finite.
 
     Args:
-        tensors: tensors of any shapes and types, on one device, by their names in messages.
+        tensors: tensors of any shapes and dtypes on one device, by the name that a message should use.
 
     Raises:
         ValueError: one of them is not finite; the message names it.

@@ -1,4 +1,4 @@
-"""Keys of an environment's entries, for all that reads or changes goals, rewards and ends."""
+"""Keys of an environment's entries, for all parts that read or change goals, rewards and ends."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ PROPOSED, PROPOSED_REACHED = "proposed", "proposed_reached"
 
 @dataclass(frozen=True, kw_only=True)
 class EnvKeys:
-    """Keys of the entries of an environment with goals; each part reads some of them.
+    """Keys of the entries of an environment with goals.
 
     Args:
         observation, achieved_goal, desired_goal, reward, terminated, done: keys of these entries.
@@ -32,7 +32,7 @@ class EnvKeys:
     done: NestedKey = "done"
 
     def check_ends(self, *, continues_after_termination: bool) -> None:
-        """Raises a ValueError if an environment that stops when it terminates has no flag to truncate at."""
+        """Raises a ValueError if ``truncated`` is None for an environment that stops at termination."""
         if self.truncated is None and not continues_after_termination:
             raise ValueError(
                 "continues_after_termination=False needs a key for truncated, to say where the environment "

@@ -23,15 +23,15 @@ def uniform(
     """Draws numbers in [0, 1) for several runs. The numbers of a run do not depend on the other runs.
 
     Args:
-        counts: R numbers of rows; a run without rows draws nothing.
-        width: numbers in a row.
+        counts: number of rows of each of R runs; a run without rows draws nothing.
+        width: number of random numbers in a row.
         generators: R generators, one for each run; None for torch's own.
 
     Keyword Args:
         dtype, device: type and device of the numbers.
 
     Returns:
-        [sum of counts, width], one run after the other.
+        The numbers [sum of counts, width], sorted by run.
 
     Example:
         >>> both = uniform([1, 2], 2, [torch.Generator().manual_seed(seed) for seed in (0, 1)])
@@ -53,7 +53,7 @@ class RunDraws:
 
     Args:
         generators: R generators, one for each run.
-        run: [n], ascending; None for one run.
+        run: [n], the run of each transition, ascending; None for one run.
 
     Example:
         >>> draws = RunDraws([torch.Generator().manual_seed(0)])
@@ -75,7 +75,7 @@ class RunDraws:
 
 
 def check_generators(runs: int, generators: Sequence[torch.Generator] | None) -> list[torch.Generator] | None:
-    """Returns the generators of R runs as a list; None for the buffer's, which only a single run may use.
+    """Returns the generators of R runs as a list; None for a single run that uses the buffer's generator.
 
     Raises:
         ValueError: there is no run, or not a generator for each of several runs.

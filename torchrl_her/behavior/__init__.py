@@ -1,4 +1,4 @@
-"""Behavior goals: which goals the next episodes ask for, proposed from those that were achieved."""
+"""Behavior goals: proposes goals that were achieved before as the goals of some of the next episodes."""
 
 from torchrl_her.behavior.factors import (
     DiscoverScore,

@@ -1,4 +1,4 @@
-"""Factors of the probability that an achieved goal is proposed."""
+"""Factors that decide which achieved goals are proposed as goals of the next episodes."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ Values = Callable[[Tensor, Tensor, Sequence[int]], Tensor]
 
 
 class GoalCandidates(NamedTuple):
-    """Achieved goals from which one is proposed for each of m episodes that begin, run after run.
+    """Candidates for the goals of m episodes that begin, sorted by run: c achieved goals for each episode.
 
     Attributes:
         goals: [m, c, g], achieved goals.
-        reached: [m, c, o], what was observed when they were achieved.
-        start: [m, o], what is observed at the beginning of each episode.
-        target: [m, g], the goal that the task itself asks for.
-        counts: R numbers of episodes, which sum to m: how many belong to each run.
-        known: R tensors [s, g], a sample of the goals that each run has achieved; empty for runs that begin
-            no episode, and if no factor needs samples (``GoalFactor.samples``).
+        reached: [m, c, o], the observations in which these goals were achieved.
+        start: [m, o], the first observation of each episode.
+        target: [m, g], the task's own goal in each episode.
+        counts: the number of these episodes in each of R runs; the sum is m.
+        known: R tensors [s, g], a sample of each run's achieved goals; empty for runs without new episodes.
+            An empty sequence if no factor needs samples (``GoalFactor.samples``).
     """
 
     goals: Tensor
@@ -39,7 +39,7 @@ class GoalCandidates(NamedTuple):
 
     @property
     def run(self) -> Tensor:
-        """The run of each episode, [m] of int64."""
+        """The index of each episode's run, [m] int64."""
         counts = torch.tensor(list(self.counts), device=self.goals.device)
         return torch.arange(len(counts), device=counts.device).repeat_interleave(counts)
 
@@ -61,15 +61,15 @@ class GoalFactor:
     samples: int = 0
 
     def __call__(self, candidates: GoalCandidates) -> Tensor:
-        """Returns a factor for each candidate of m episodes: [m, c] of at least 0, or of bool."""
+        """Returns the factor of each candidate goal, [m, c]: numbers of at least 0, or bool."""
         return candidates.goals.new_ones(candidates.goals.shape[:-1])
 
     def record(self, ended: Tensor, achieved: Tensor) -> None:
         """Records how many episodes with proposed goals have ended, and in how many the goal was achieved.
 
         Args:
-            ended: [R] int64, of each run.
-            achieved: [R] int64.
+            ended: [R] int64, number of ended episodes of each run.
+            achieved: [R] int64, number of these in which the goal was achieved.
         """
 
     def state_dict(self) -> dict[str, Any]:
@@ -81,7 +81,7 @@ class GoalFactor:
 
 
 class Successes:
-    """Success rates of recent episodes, exponential moving averages for R runs.
+    """Success rates of R runs: exponential moving averages over recent episodes.
 
     Args:
         runs: R.
@@ -91,7 +91,7 @@ class Successes:
             value.
 
     Attributes:
-        rate: [R] of float64; ``start`` before the first episode.
+        rate: [R] float64, the success rate of each run; ``start`` before the first episode.
 
     Example:
         >>> successes = Successes(1, memory=2.0, start=0.0)
@@ -107,13 +107,13 @@ class Successes:
         self.rate = torch.full((runs,), start, dtype=torch.float64)
 
     def record(self, ended: Tensor, achieved: Tensor) -> None:
-        """Counts ended episodes [R], and [R] of these in which the goal was achieved."""
+        """Adds the number [R] of ended episodes of each run, and the number [R] that achieved their goal."""
         kept = torch.exp(-ended.double() / self.memory)
         self.rate = kept * self.rate.to(kept.device) + (1 - kept) * achieved / ended.clamp(min=1)
 
 
 class InverseDensity(GoalFactor):
-    """Prefers goals with few others around them: the inverse of their density among all that were achieved.
+    """Prefers rare goals: the factor is the inverse of a goal's density among the achieved goals.
 
     MEGA proposes the goal of the least density (Pitis et al., Maximum Entropy Gain Exploration for Long
     Horizon Multi-goal RL, 2020, arXiv 2007.02832). To prefer rare goals as virtual goals, use
@@ -123,7 +123,7 @@ class InverseDensity(GoalFactor):
     kernel estimate for goals of up to three coordinates, and a nearest-neighbor estimate for more.
 
     Keyword Args:
-        samples: achieved goals that the density is estimated from.
+        samples: number of achieved goals from which the density is estimated.
         sigma: width of the kernel, in standard deviations.
         k: the distance to the k-th nearest goal gives the nearest-neighbor estimate.
 
@@ -163,26 +163,26 @@ class ValueCutoff(GoalFactor):
 
     Each run has its own cut-off, which moves with the success rate of its proposed goals. The cut-off falls
     while this rate is above ``high``, by ``step`` in ``memory`` episodes. It rises while the rate is below
-    ``low``, up to its first value. If all of an episode's candidates are below the cut-off, the one with the
-    highest value stays. After Pitis et al., Maximum Entropy Gain Exploration for Long Horizon Multi-goal RL,
-    2020 (arXiv 2007.02832), section 3.3.
+    ``low``, up to its initial value. If all of an episode's candidates are below the cut-off, the one with
+    the highest value stays. After Pitis et al., Maximum Entropy Gain Exploration for Long Horizon Multi-goal
+    RL, 2020 (arXiv 2007.02832), section 3.3.
 
     Args:
-        values: values of goals, for instance :class:`~torchrl_her.behavior.GoalValues`.
+        values: function that returns values of goals, such as :class:`~torchrl_her.behavior.GoalValues`.
 
     Keyword Args:
         runs: R.
-        cutoff: first value of the cut-off, which is also its greatest.
+        cutoff: initial and greatest value of the cut-off.
         floor: least value of the cut-off.
         step: how far the cut-off moves in ``memory`` episodes.
         low, high: success rates between which the cut-off does not move.
         memory: episodes over which success is averaged.
 
     Attributes:
-        cutoff: [R] of float64.
+        cutoff: [R] float64, the present cut-off of each run.
 
     Raises:
-        ValueError: not 0 <= low <= high <= 1, or the floor lies above the cut-off.
+        ValueError: 0 <= low <= high <= 1 does not hold, or the floor lies above the cut-off.
 
     Example:
         >>> values = lambda observation, goals, counts: -goals.abs()  # the nearer to 0 the better
@@ -250,12 +250,12 @@ class DiscoverScore(GoalFactor):
     With a single critic S is 0; add :class:`InverseDensity`, which then takes the place of S.
 
     Args:
-        values: values of goals, for instance :class:`~torchrl_her.behavior.GoalValues`.
+        values: function that returns values of goals, such as :class:`~torchrl_her.behavior.GoalValues`.
 
     Keyword Args:
         runs: R.
         beta: how much the critics' disagreement counts.
-        alpha: first value of alpha.
+        alpha: initial value of alpha.
         step: how far alpha moves in ``memory`` episodes if their success rate is off the target by 1.
         target: success rate of proposed goals that alpha steers to.
         temperature: divisor of the score, in the unit of values; the lower, the more the best goal is
@@ -263,16 +263,16 @@ class DiscoverScore(GoalFactor):
         memory: episodes over which success is averaged.
 
     Attributes:
-        alpha: [R] of float64.
+        alpha: [R] float64, the present alpha of each run.
 
     Raises:
         ValueError: alpha or target is outside of [0, 1], or the temperature is not positive.
 
     Example:
         >>> values = lambda observation, goals, counts: -(observation.view(1, -1, 1) - goals).abs()
-        >>> goals = torch.tensor([[[1.0], [3.0], [6.0]]])  # from 0, the task wants 4
+        >>> goals = torch.tensor([[[1.0], [3.0], [6.0]]])  # from the start 0 to the task's goal 4
         >>> candidates = GoalCandidates(goals, goals, torch.zeros(1, 1), torch.full((1, 1), 4.0), [1])
-        >>> DiscoverScore(values, alpha=0.0)(candidates).log().tolist()  # towards the goal alone
+        >>> DiscoverScore(values, alpha=0.0)(candidates).log().tolist()  # only V(s_g, g*) counts
         [[-2.0, 0.0, -1.0]]
     """
 

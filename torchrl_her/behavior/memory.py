@@ -13,18 +13,18 @@ from torchrl_her.randomness import Generators, uniform
 
 
 class AchievedGoals:
-    """The newest achieved goals of R runs, each with what was observed when it was achieved.
+    """The newest achieved goals of R runs, with the observations in which they were achieved.
 
     Each run has its own ring buffer, on the device of the first goals that are added.
 
     Args:
-        capacity: goals that each run keeps.
+        capacity: number of goals that each run keeps.
 
     Keyword Args:
         runs: R.
 
     Raises:
-        ValueError: ``capacity`` or ``runs`` is below 1; when adding, more goals are added at once than fit.
+        ValueError: ``capacity`` or ``runs`` is below 1; a run adds more goals at once than its capacity.
 
     Example:
         >>> memory = AchievedGoals(3, runs=2)
@@ -53,7 +53,7 @@ class AchievedGoals:
 
         Args:
             goals: [N, g], R equal blocks in the order of the runs.
-            observations: [N, o].
+            observations: [N, o], the observations in which the goals were achieved.
 
         Keyword Args:
             which: [N] of bool, the goals that are added; None for all.
@@ -80,15 +80,16 @@ class AchievedGoals:
             stored[flat[which]] = new[which].to(stored)
 
     def draw(self, counts: Sequence[int], width: int, generators: Generators) -> Tensor:
-        """Draws goals for episodes of several runs, all goals of a run being equally likely.
+        """Draws stored goals for new episodes of R runs, uniformly from the goals of the episode's run.
 
         Args:
-            counts: R numbers of episodes; 0 where a run has no goals.
-            width: goals for each episode.
+            counts: number of new episodes of each run; must be 0 for runs without goals.
+            width: number of goals that are drawn for each episode.
             generators: R generators, one for each run; None for torch's own.
 
         Returns:
-            [sum of counts, width] of int64, for :meth:`goals` and :meth:`observations`, run after run.
+            Positions in the memory, [sum of counts, width] int64, sorted by run, which :meth:`goals` and
+            :meth:`observations` take.
         """
         run = torch.arange(self.runs).repeat_interleave(torch.tensor(list(counts))).to(self._written.device)
         size = self._written.clamp(max=self.capacity)[run].unsqueeze(1)
@@ -108,7 +109,7 @@ class AchievedGoals:
         self._written[run] = 0
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns tensors and plain data that :meth:`load_state_dict` takes."""
+        """Returns the stored goals and observations of all runs, as tensors and plain data."""
         rows = []
         for part in self._rows or ():
             blocks = zip(part.split(self.capacity), self.sizes, strict=True)
@@ -119,7 +120,7 @@ class AchievedGoals:
         """Restores the state that :meth:`state_dict` returned.
 
         Raises:
-            ValueError: it is of another number of runs, or of another capacity.
+            ValueError: the state has another number of runs, or another capacity.
         """
         written, capacity = state["written"], state["capacity"]
         if (len(written), capacity) != (self.runs, self.capacity):

@@ -1,4 +1,4 @@
-"""Behavior goals: the goal that the next episode asks for is proposed from goals that were achieved."""
+"""Transform that gives some episodes a goal that was achieved before, in place of the task's own."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ class BehaviorGoals(Transform):
 
         weight(g) * factor(g) * factor(g) * ...
 
-    where ``weight`` says how useful a goal is, as for virtual goals. The factors say how well the goal can be
-    achieved from the episode's start, and how far it leads to the task's goal. The episode's reward,
+    where ``weight`` is how useful a goal is, as for virtual goals. The factors measure how well the goal can
+    be achieved from the episode's start, and how well it leads to the task's goal. The episode's reward,
     terminated and done are then computed for the proposed goal. All other episodes keep the task's own goal.
     Two flags [..., 1] are written: ``proposed``, where the goal is a proposed one, and ``proposed_reached``,
     where a proposed goal was achieved in the episode.
@@ -47,8 +47,8 @@ class BehaviorGoals(Transform):
     | DISCOVER | none | | ``DiscoverScore``; with a single critic ``InverseDensity``, too | True |
 
     In a curriculum, put it behind :class:`~torchrl_her.StateToObs` and before :class:`~torchrl_her.ZeroPad`.
-    It acts in the last stage, which is the full task, if ``stage_key`` is given or :meth:`set_active` is
-    called.
+    If episodes have stages, ``stage_key`` restricts it to those in ``stage``; if runs have stages, switch it
+    on and off with :meth:`set_active`.
 
     The environments of R runs are R equal blocks of the batch's first dimension, in the order of the runs.
     Episodes that end by a time limit count as ended only if a transform before this one, or the environment,
@@ -64,9 +64,9 @@ class BehaviorGoals(Transform):
         factors: the factors by which the weights are multiplied.
         update_on: goals that the weights are updated on: ``achieved`` or ``proposed`` ones.
         remember: whether the transform remembers achieved goals; if not, add goals by ``memory.add``.
-        greedy: whether the goal of the greatest product is proposed; if not, one in proportion to it.
+        greedy: whether to propose the goal with the greatest product; if not, a goal is drawn in proportion.
         real_share: share of the episodes in which the task's own goal stays.
-        candidates: number of goals of which one is proposed.
+        candidates: number of achieved goals drawn for each episode, of which one is proposed.
         memory: number of goals that each run remembers.
         runs: R.
         generators: generators, one for each run; None for torch's own, with one run only.
@@ -75,7 +75,7 @@ class BehaviorGoals(Transform):
             episode; if not, the episode is truncated there.
         keys: keys of the entries that are read. All are also written, except observation and achieved goal.
         real_goal_key: key under which the task's own goal is written.
-        stage_key: key of the stage [..., 1] that an episode is played in, if it has one.
+        stage_key: key of the stage [..., 1] that an episode is played in, if episodes have stages.
         stage: index of the stage in which goals are proposed.
 
     Attributes:
@@ -94,7 +94,7 @@ class BehaviorGoals(Transform):
         >>> env = make_env("hand_v0", num_envs=4, seed=0)
         >>> goals = BehaviorGoals(GoalReward(0.1), real_share=0.0, continues_after_termination=True)
         >>> env = TransformedEnv(env, goals)
-        >>> _ = env.rollout(10)  # which is remembered
+        >>> _ = env.rollout(10)  # its goals are remembered
         >>> begun = env.reset()
         >>> begun["proposed"].flatten().tolist()
         [True, True, True, True]
@@ -146,7 +146,7 @@ class BehaviorGoals(Transform):
         self._active = [True] * runs
 
     def set_active(self, active: bool, *, run: int = 0) -> None:
-        """Switches the memory of goals and the proposals of a run on or off. Switching on restarts IBS."""
+        """Switches memory and proposals of a run on or off; its weights start anew when switched on."""
         if active and not self._active[run] and self.weights:
             self.weights[run].clear()
             if isinstance(weights := self.weights[run], InstructiveWeights):
@@ -205,7 +205,7 @@ class BehaviorGoals(Transform):
         wanted = real
         if goals is not None:
             wanted = _rows(real).index_put((proposed,), goals.to(real)).view(real.shape)
-        # TorchRL leaves the environments that were not reset as they were.
+        # Set for all environments: TorchRL discards the values of those that were not reset.
         shown = (wanted, real, flags, torch.zeros_like(flags))
         for key, value in zip((goal_key, real_key, proposed_key, reached_key), shown, strict=True):
             tensordict_reset.set(key, value)
@@ -228,10 +228,10 @@ class BehaviorGoals(Transform):
         before = self._get(next_tensordict, self.keys.reward)
         ended = self._get(next_tensordict, self.keys.terminated)
         fell = ended & (before < self.achieved_reward)
-        if bool(fell.any()):  # a fall ends episodes of any goal; an end by the task's own goal is none
+        if bool(fell.any()):  # a fall ends the episode for any goal; success at the task's own goal does not
             own_reward, own_end = call_reward(self.reward_fn, outcome, real)
             fell = fell & ~own_end
-            reward = reward + (before - own_reward).clamp(max=0.0) * fell  # and costs the same
+            reward = reward + (before - own_reward).clamp(max=0.0) * fell  # the fall's penalty
         reached = self._get(tensordict, reached_key) | (proposed & (reward >= self.achieved_reward))
         terminated = torch.where(proposed, terminated | fell, ended)
         done = terminated
@@ -262,7 +262,7 @@ class BehaviorGoals(Transform):
             observation_spec[key] = Binary(shape=shape, dtype=torch.bool, device=goal.device)
         return observation_spec
 
-    # The work
+    # Helpers
 
     def _takes_part(self, tensordict: TensorDictBase, goals: Tensor) -> Tensor | None:
         """Returns which environments [N] store and propose goals; None if all do."""
@@ -324,7 +324,7 @@ class BehaviorGoals(Transform):
         return chosen, goals
 
     def _sample(self, counts: Sequence[int]) -> Sequence[Tensor]:
-        """Draws, for each run that begins episodes, as many goals as the most demanding factor needs."""
+        """Draws a sample of achieved goals for each run with new episodes, as large as the factors need."""
         number = max((factor.samples for factor in self.factors), default=0)
         draws = [min(1, count) for count in counts]
         if number == 0:

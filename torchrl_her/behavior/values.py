@@ -18,7 +18,7 @@ Prepare = Callable[[TensorDictBase], TensorDictBase]
 
 
 class GoalValues:
-    """Computes the values [m, c, E] that E critics give to candidate goals, from the first observations.
+    """Computes the values that a loss's critics give to candidate goals, from an episode's first observation.
 
     Values are of greedy actions. With rewards of -1 until the goal is achieved, a goal that takes d
     steps has the value -(1 - gamma^d) / (1 - gamma).
@@ -30,14 +30,14 @@ class GoalValues:
 
     Keyword Args:
         runs: R, whose networks are stacked.
-        before_actor: called with rows [R * n, c] before the actor, R equal blocks in the order of the runs;
-            for example :class:`~torchrl_her.ZeroPad`.
-        before_critic: called with these rows before the critics; for example
+        before_actor: function that changes the rows before the actor reads them, for example
+            :class:`~torchrl_her.ZeroPad`. The rows are R equal blocks, in the order of the runs.
+        before_critic: function that changes these rows before the critics read them, for example
             :class:`~torchrl_her.modules.RunningNorm`.
         keys: keys of observation and desired goal, which the networks see.
 
     Raises:
-        ValueError: the loss has no critics that are known.
+        ValueError: it is not known how to call the critics of this loss.
 
     Example:
         >>> from torchrl.data import Bounded
@@ -67,12 +67,12 @@ class GoalValues:
         """Returns the values of goals.
 
         Args:
-            observation: [m, o], or [m, c, o] with one for each goal; run after run.
-            goals: [m, c, g], or [m, 1, g] with one for all.
-            counts: R numbers of episodes, which sum to m: how many belong to each run.
+            observation: [m, o], one for each of m episodes, or [m, c, o], one for each goal; sorted by run.
+            goals: [m, c, g], c for each episode, or [m, 1, g], one for all observations of an episode.
+            counts: number of episodes of each run; the sum is m.
 
         Returns:
-            [m, c, E], on the goals' device.
+            The values [m, c, E] by E critics, on the goals' device.
         """
         if observation.ndim == 2:
             observation = observation.unsqueeze(1)

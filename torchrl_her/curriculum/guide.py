@@ -25,24 +25,24 @@ class GuidedExploration(TensorDictModuleBase):
     goal is achieved, and then the present policy. That is the self-guided exploration of Luo et al., Relay
     Hindsight Experience Replay, 2022 (arXiv 2208.00843), here with the stages one after another.
 
-    With ``per="step"``, as in the paper, it is drawn in each step whether the copy acts, as long as the goal
-    of the stage below is not achieved at that moment. So the copy also achieves a lost goal again.
+    With ``per="step"``, as in the paper, whether the copy acts is drawn in each step in which the goal of the
+    stage below is not achieved. So the copy also acts when that goal was achieved and then lost.
 
     If each episode has its own stage (``stage_key``), the present policy itself guides, as in the paper: it
     acts as in the first stage until the goal of that stage is achieved, then as in the next stage, up to the
     episode's own stage. With ``per="step"`` it acts as in the stage after the last one whose goal is achieved
     at that moment. So the goal of a stage must include all that the next stage requires.
 
-    Put it behind the policy and before noise, and an InitTracker of TorchRL's into the environment. The
+    Put it behind the policy and before noise. The environment must have TorchRL's ``InitTracker``. The
     environments of R runs are R equal blocks of the batch, in the order of the runs. Under
     ``set_exploration_type(ExplorationType.DETERMINISTIC)`` it does nothing.
 
     Args:
-        policy: the policy that learns, which is copied. It reads only the network's input.
+        policy: the policy that is trained. Its only input is the network's input.
         curriculum: the stages.
 
     Keyword Args:
-        share: fraction of episodes that are guided; if episodes have stages, of the episodes above the first.
+        share: fraction of episodes, or of steps, that are guided. Episodes in the first stage do not count.
         per: whether guidance is drawn for each ``"episode"`` or for each ``"step"``.
         runs: R; the weights of R runs are stacked, along the first dimension of each parameter.
         generators: generators, one for each run, or None for torch's own.
@@ -57,7 +57,7 @@ class GuidedExploration(TensorDictModuleBase):
             None before the first step.
 
     Raises:
-        ValueError: the share is outside of [0, 1], or ``per`` is neither of the two.
+        ValueError: the share is outside of [0, 1], or ``per`` is another word.
 
     Example:
         >>> from tensordict.nn import TensorDictModule, TensorDictSequential
@@ -69,9 +69,9 @@ class GuidedExploration(TensorDictModuleBase):
         >>> actor = make_actor([3], 1, in_keys=["input"])
         >>> guide = GuidedExploration(actor, Curriculum(stages, 3), share=1.0)
         >>> policy = TensorDictSequential(actor, guide)
-        >>> guide.follow(actor, 0)  # the first stage was learned
-        >>> _ = [weight.data.zero_() for weight in actor.parameters()]  # what is learned then
-        >>> state = torch.tensor([[1.0, 0.0, 3.0], [3.0, 0.0, 3.0]])  # the second one is near
+        >>> guide.follow(actor, 0)  # the policy has learned the first stage
+        >>> _ = [weight.data.zero_() for weight in actor.parameters()]  # the policy forgets
+        >>> state = torch.tensor([[1.0, 0.0, 3.0], [3.0, 0.0, 3.0]])  # the second row has achieved "near"
         >>> begun = torch.ones(2, 1, dtype=torch.bool)
         >>> rows = TensorDict({"state": state, "input": state, "is_init": begun}, [2])
         >>> (policy(rows)["action"] != 0).tolist()
@@ -105,14 +105,14 @@ class GuidedExploration(TensorDictModuleBase):
             self.module = deepcopy(policy).requires_grad_(False)
         else:
             self.in_keys.append(stage_key)
-            self._policy = (policy,)  # not a submodule: its weights are copies of the policy's earlier ones
+            self._policy = (policy,)  # in a tuple: as a submodule, its weights would be registered twice
         self.curriculum, self.share, self.per = curriculum, share, per
         self.generators = [None] * runs if generators is None else list(generators)
         self.register_buffer("stage", torch.full((runs,), -1))
         self.guided: Tensor | None = None
-        # For each stage: its inputs, its achieved and its desired goal, in the state with a zero appended.
+        # For each stage: columns of its inputs, achieved and desired goal in ``Curriculum.extend(state)``.
         self._columns = torch.tensor([self._columns_of(stage) for stage in curriculum.stages])
-        # An episode is guided up to the stage below its own, so the last one's threshold is not needed.
+        # An episode is guided up to the stage below its own, so the last stage needs no threshold here.
         self._squares = torch.tensor([(stage.threshold or 0.0) ** 2 for stage in curriculum.stages])
 
     @property
@@ -160,7 +160,7 @@ class GuidedExploration(TensorDictModuleBase):
         if not bool((guided >= 0).any()):
             return tensordict
         acting, after = guided >= 0, guided + 1
-        if self.per == "step" and top is not None:  # achieve again what was lost
+        if self.per == "step" and top is not None:  # goals of lower stages may be lost again
             after = self._after_the_last_achieved(state, top)
         else:
             acting &= self._achieved(state, guided)
@@ -169,7 +169,7 @@ class GuidedExploration(TensorDictModuleBase):
         rows = TensorDict({self.guide.in_keys[0]: inputs}, tensordict.batch_size)
         policy_action = tensordict.get(action_key)
         acts = guided >= 0 if policy_action.ndim == guided.ndim else (guided >= 0).squeeze(-1)
-        # Greedy: whether it is called depends on other runs, so it must not draw numbers for this one.
+        # Greedy: the guide is called for all runs if one is guided, so it must not use their random numbers.
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             action = self.guide(rows).get(action_key)
         return tensordict.set(action_key, torch.where(acts, action, policy_action))
@@ -200,13 +200,13 @@ class GuidedExploration(TensorDictModuleBase):
         return after
 
     def _achieved(self, state: Tensor, stage: Tensor) -> Tensor:
-        """Returns whether each row's goal in the stage [B, 1] of this row is achieved, [B, 1] of bool."""
+        """Returns a mask [B, 1] of the rows that achieve the goal of the stage given for each row, [B, 1]."""
         _, achieved, desired = self._look(state, stage)
         squares = self._squares.to(state)[stage.clamp(min=0)].view(achieved.shape[:-1])
         return ((achieved - desired).square().sum(-1) < squares).view(stage.shape)
 
     def _look(self, state: Tensor, stage: Tensor) -> tuple[Tensor, ...]:
-        """Returns the network's input, the achieved and the desired goal by the stage of each row."""
+        """Returns network input, achieved and desired goal of each row, as the row's given stage has them."""
         index = self._columns.to(state.device)[stage.flatten().clamp(min=0)]
         entries = take_columns(self.curriculum.extend(state), index)
         goal = self.curriculum.goal_width

@@ -1,4 +1,4 @@
-"""Running normalization of the networks' input in a curriculum, whose stages see different things."""
+"""Running normalization of the networks' input in a curriculum, whose stages have different inputs."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def restart_inputs(
         ... )
         >>> norm = RunningNorm({"input": 3})
         >>> norm.count("input", torch.tensor([[4.0, 5.0], [6.0, 7.0]]))
-        >>> restart_inputs(norm, near, far)  # the second input was the goal and is an observation: both of 1
+        >>> restart_inputs(norm, near, far)  # both stages have entry 1 as the second input
         >>> norm.moments_of("input").n.tolist()
         [2.0, 2.0, 0.0]
     """

@@ -18,7 +18,7 @@ class EpisodeStages(CurriculumProgress):
 
     Stages belong to episodes here; the runs themselves are always in the last stage, the full task.
     :class:`~torchrl_her.StateToObs` draws the stages and writes the stage of each row, so that one buffer
-    holds rows of all stages and :class:`~torchrl_her.ZeroPad` pads each by its own.
+    holds rows of all stages and :class:`~torchrl_her.ZeroPad` pads each row by its stage.
     :class:`~torchrl_her.curriculum.StageOutcomes` counts how episodes ended. Random numbers are drawn on the
     CPU. After Luo et al., Relay Hindsight Experience Replay, 2022 (arXiv 2208.00843).
 
@@ -47,7 +47,7 @@ class EpisodeStages(CurriculumProgress):
     """
 
     by_episode = True
-    # Whether stages depend on how episodes have ended: all of them must then be played in one process.
+    # Whether the drawn stages depend on earlier outcomes. If so, one process must play all episodes.
     adapts = False
 
     def __init__(
@@ -70,7 +70,7 @@ class EpisodeStages(CurriculumProgress):
 
     @property
     def shares(self) -> Tensor:
-        """Returns the probability of each stage for the next episode of each run, [R, L] of float64."""
+        """The probability of each of L stages for the next episode of each run, [R, L] float64."""
         return self._shares
 
     def mean_stage(self, run: int) -> float:
@@ -80,10 +80,10 @@ class EpisodeStages(CurriculumProgress):
         """Draws the stages of episodes that begin.
 
         Args:
-            counts: R numbers of episodes.
+            counts: number of new episodes of each run.
 
         Returns:
-            [sum of counts] of int64, run after run.
+            Index of each episode's stage, [sum of counts] int64, sorted by run.
         """
         numbers = uniform(counts, 1, self.generators, dtype=torch.float64)
         below = self.shares.cumsum(1).repeat_interleave(torch.tensor(list(counts)), 0)
@@ -93,8 +93,8 @@ class EpisodeStages(CurriculumProgress):
         """Records how many episodes of each run and stage have ended, and in how many the goal was achieved.
 
         Args:
-            ended: [R, L] int64.
-            achieved: [R, L] int64.
+            ended: [R, L] int64, number of ended episodes.
+            achieved: [R, L] int64, number of these in which the goal was achieved.
         """
 
     def set_stage(self, run: int, stage: int) -> None:
@@ -115,17 +115,17 @@ class TeacherStudent(EpisodeStages):
     A stage's progress is the distance between two averages of its success: over its recent episodes, and over
     the newer half of them. A share of the episodes draws all stages with equal probability, so that a stage
     without progress is noticed when its success changes. After Matiisen et al., Teacher-Student Curriculum
-    Learning, 2017 (arXiv 1707.00183), here with averages that forget in place of windows.
+    Learning, 2017 (arXiv 1707.00183), here with exponential moving averages in place of windows.
 
     Args:
         curriculum, runs, generators: as in :class:`~torchrl_her.curriculum.EpisodeStages`.
         memory: number of later episodes of a stage after which an episode's weight has fallen to 1 / e.
         uniform_share: share of the episodes for which all stages have the same probability.
-        still: constant that is added to the progress of each stage, so that changes of success by chance
-            alone hardly prefer a stage.
+        still: constant that is added to the progress of each stage, so that random changes of the success
+            rate have little effect.
 
     Attributes:
-        long, short: [R, L] of float64, success over recent episodes, and over the newest.
+        long, short: [R, L] float64, success rates over recent episodes, and over the newest of these.
 
     Raises:
         ValueError: an option is out of its range.
@@ -137,7 +137,7 @@ class TeacherStudent(EpisodeStages):
         ... )
         >>> teacher = TeacherStudent(Curriculum([stage, stage], 2), uniform_share=0.2)
         >>> teacher.record_episodes(torch.tensor([[50, 50]]), torch.tensor([[40, 0]]))
-        >>> [round(share, 2) for share in teacher.shares[0].tolist()]  # only the first one has made progress
+        >>> [round(share, 2) for share in teacher.shares[0].tolist()]  # only the first stage makes progress
         [0.81, 0.19]
     """
 

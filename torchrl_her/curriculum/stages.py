@@ -27,12 +27,12 @@ _LISTS = ("observation", "achieved_goal", "desired_goal")
 
 @dataclass(frozen=True, kw_only=True)
 class CurriculumStage:
-    """Stage of a curriculum: the entries of the state that it observes, achieves and desires.
+    """Stage of a curriculum: the entries of the state that are its observation and its goals.
 
     Args:
         name: for messages and reports.
-        observation, achieved_goal, desired_goal: indices into the state vector, or names for them that
-            :class:`~torchrl_her.Curriculum` is given.
+        observation, achieved_goal, desired_goal: indices into the state vector, or names that the argument
+            ``names`` of :class:`~torchrl_her.Curriculum` translates to indices.
         constant_goal: one goal for all episodes, as a gap in a wall, in place of ``desired_goal``; in the
             unit of the achieved goal.
         threshold: the goal is achieved at distances below this, in the unit of the state. The last stage,
@@ -127,7 +127,7 @@ class Curriculum:
         state_width: width of the state vector, the real observation with the real goal behind it.
 
     Keyword Args:
-        names: the indices into the state that names in the stages' lists stand for.
+        names: indices into the state, for each name that stages use in place of indices.
 
     Attributes:
         stages: the stages, with indices in place of names and of constant goals.
@@ -225,7 +225,8 @@ class Curriculum:
             stage: index of the stage, from 0.
 
         Returns:
-            [..., observation_width] and [..., goal_width] twice, zeros behind the stage's own entries.
+            Observation [..., observation_width], achieved and desired goal [..., goal_width], each filled up
+            with zeros.
         """
         entries = self.extend(state).index_select(-1, self.state_index[stage].to(state.device))
         observation, achieved, desired = entries.split(
@@ -252,12 +253,12 @@ class Curriculum:
         return [*self.padded(stage.observation, self.observation_width), *self.goal_index(stage)]
 
     def goal_index(self, stage: CurriculumStage) -> list[Any]:
-        """Returns the indices of a stage's achieved and desired goal, each with zeros behind it."""
+        """Returns the indices of a stage's achieved and desired goal, each filled up with a zero's index."""
         goals = (stage.achieved_goal, stage.desired_goal)
         return [index for goal in goals for index in self.padded(goal, self.goal_width)]
 
     def padded(self, indices: Indices, width: int) -> list[Any]:
-        """Returns indices into the extended state, followed by indices of zeros up to a width."""
+        """Returns indices into the extended state, filled up to a width with the index of its zero."""
         return [*indices, *[self.state_width] * (width - len(indices))]
 
     def _input_index(self, stage: CurriculumStage) -> list[int]:
@@ -266,7 +267,7 @@ class Curriculum:
 
 
 def _resolve(stage: CurriculumStage, names: Mapping[str, Sequence[int]]) -> CurriculumStage:
-    """Returns a stage with indices in place of names, checked on its own."""
+    """Replaces the names in a stage by indices, which :class:`CurriculumStage` then checks."""
 
     def indices(key: str) -> list[int]:
         resolved_indices: list[int] = []
@@ -316,7 +317,7 @@ class CurriculumProgress:
         (1, 0)
     """
 
-    # Whether each episode has a stage of its own, and not each run.
+    # True if each episode has a stage of its own; False if each run has one.
     by_episode = False
 
     def __init__(
@@ -345,7 +346,7 @@ class CurriculumProgress:
 
     @property
     def successes(self) -> list[list[float]]:
-        """Copies of the R windows: samples of the present stage, the latest at the end."""
+        """Latest samples of success of each run in its present stage, the newest last; a copy."""
         return [list(samples) for samples in self._successes]
 
     @property
@@ -401,12 +402,12 @@ class CurriculumProgress:
             Whether the run moved on to its next stage.
 
         Raises:
-            ValueError: there is no such run, the shape is another one, or a sample is outside of [0, 1].
+            ValueError: there is no such run, the shape is wrong, or a sample is outside of [0, 1].
         """
         return self._record(self._check_run(run), _samples(successes))
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns tensors and plain data that :meth:`load_state_dict` takes."""
+        """Returns stages, samples of success and numbers of evaluations of all runs."""
         return {
             "stage": self.stage,
             "successes": self.successes,
@@ -417,7 +418,7 @@ class CurriculumProgress:
         """Restores the state that :meth:`state_dict` returned.
 
         Raises:
-            ValueError: it has another number of runs, or a stage that does not exist.
+            ValueError: the state has another number of runs, or a stage that does not exist.
         """
         stages = tuple(state["stage"].tolist())
         if len(stages) != self.runs:

@@ -12,7 +12,7 @@ from torchrl_her.replay_buffers.writer import HERWriter
 
 
 def set_stage_goals(writer: Writer, stage: CurriculumStage, *, run: int = 0) -> None:
-    """Lets a writer relabel a run with a stage's reward, and use its IBS weights only if the stage is set so.
+    """Sets the reward by which a writer relabels a run, and whether IBS weights apply, as a stage has them.
 
     Args:
         writer: writer of one run or several.
@@ -40,7 +40,7 @@ def enter_stage(
     epsilon: float | None = None,
     run: int = 0,
 ) -> None:
-    """Begins a run's stage: empties its rows, priorities and q, and resets its exploration and sigma.
+    """Begins a run's stage: empties its buffer and restarts its goal weights and its exploration.
 
     Networks and optimizer are not touched, since the next stage builds on what was learned.
 

@@ -1,4 +1,4 @@
-"""CHER as TorchRL transforms: a stage's view of an environment, and the network's input."""
+"""Transforms for curricula: they show an environment as a stage sees it, and build the network's input."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from torchrl_her.replay_buffers.keys import device_of
 
 
 def take_columns(rows: Tensor, index: Tensor) -> Tensor:
-    """Selects the columns [..., n] of rows; each of B equal blocks of rows has columns of its own, [B, n]."""
+    """Selects n columns of rows; ``index`` [B, n] has the columns for each of B equal blocks of rows."""
     if len(index) == 1:
         return rows.index_select(-1, index[0])
     blocks = rows.reshape(len(index), -1, rows.shape[-1])
@@ -47,8 +47,8 @@ class _StageTransform(Transform):
         super().__init__(in_keys=in_keys, out_keys=out_keys)
         self.curriculum, self.progress, self.run = curriculum, progress, run
         self.stage_key = unravel_key(stage_key)
-        self._table: tuple[Any, Any] = (None, None)  # what the table of columns was made for, and the table
-        self._shown_in: tuple[int, ...] | None = None  # the stages that the last states were shown in
+        self._table: tuple[Any, Any] = (None, None)  # stages and device of a table of columns, and the table
+        self._shown_in: tuple[int, ...] | None = None  # stages of all runs in the last step or reset
 
     def _stages(self) -> tuple[int, ...]:
         """Returns the stage of each block of rows; a single one if all runs are in the same stage."""
@@ -64,7 +64,7 @@ class _StageTransform(Transform):
         return self._get(tensordict, self.stage_key, 1).squeeze(-1)
 
     def _columns(self, columns: Tensor, rows: Tensor | None, device: torch.device) -> Tensor:
-        """Selects from [stages, n] the columns [B, n] of B blocks, or of rows that carry their stages."""
+        """Selects the columns [B, n] of B blocks, or of B rows, from those of all stages, [stages, n]."""
         stages = self._stages() if rows is None else tuple(range(len(self.curriculum)))
         made_for = stages, device
         if self._table[0] != made_for:
@@ -76,7 +76,7 @@ class _StageTransform(Transform):
         check_blocks(shape[:-1], self.progress.runs if self.run is None else 1)
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        if self._shown_in is None:  # later resets may be partial: the other rows stay as they were shown
+        if self._shown_in is None:  # later resets may be partial: the other rows keep their stage
             self._shown_in = self.progress.stages
         return self._call(tensordict_reset)
 
@@ -84,7 +84,7 @@ class _StageTransform(Transform):
         """Recomputes the observations before a step if stages have changed since the last one.
 
         Returns:
-            [...] of bool, which rows were shown in another stage; None if stages are as they were.
+            Mask [...] of the rows whose observations changed; None if no stage has changed.
         """
         stages = self.progress.stages
         changed, self._shown_in = self._shown_in not in (None, stages), stages
@@ -138,9 +138,9 @@ class StateToObs(_StageTransform):
     and would stay in the stages in which they were started.
 
     Change stages between episodes, and reset the collector. If a stage changes in mid-episode, the next step
-    has the new stage's observations before and after the action, and the episode is truncated there (done,
-    without a key for ``truncated``). The action of that step was chosen in the old stage. For this the
-    environment must work on the tensors that the collector keeps, so on the policy's device.
+    has the new stage's observations before and after the action, and the episode is truncated there (or just
+    done, if there is no key for ``truncated``). The action of that step was chosen in the old stage. This
+    works only if the environment is on the policy's device: it then shares the collector's tensors.
 
     GymWrapper renames an entry ``state`` of a dict to ``observation``; a RenameTransform before this one
     undoes it.
@@ -165,7 +165,7 @@ class StateToObs(_StageTransform):
         ValueError: ``progress`` belongs to another curriculum, or ``continues_after_termination`` is False
             without a key for ``truncated``; when used, the state has another width, or the batch is
             not R equal blocks.
-        KeyError: when used, the environment has no such state or flags.
+        KeyError: when used, the environment lacks the state or a flag.
 
     Example:
         >>> from torchrl.envs import TransformedEnv
@@ -182,7 +182,7 @@ class StateToObs(_StageTransform):
         >>> progress = CurriculumProgress(curriculum, runs=2)
         >>> env = TransformedEnv(make_env("hand_v1", num_envs=4), StateToObs(curriculum, progress))
         >>> progress.set_stage(1, 1)
-        >>> (env.reset()["observation"][:, 5:7] != 0).any(-1).tolist()  # who sees the ball
+        >>> (env.reset()["observation"][:, 5:7] != 0).any(-1).tolist()  # which environments see the ball
         [False, False, True, True]
     """
 
@@ -362,14 +362,14 @@ class StageOutcomes(Transform):
 
 
 class ZeroPad(_StageTransform):
-    """The network's input: [n entries of the observation | desired goal | zeros], n of the run's stage.
+    """Builds the network's input: [the stage's n observation entries | desired goal | zeros].
 
     Put it where the goal is final: for acting, after :class:`~torchrl_her.StateToObs` in the environment; for
     learning, in the replay buffer, where it works on sampled transitions after they were relabeled. The input
     should not be stored: name it in ``HERWriter(exclude=("state", "input"))``. If it was stored nevertheless,
     this transform replaces it.
 
-    It works on the root and, as a module or in a replay buffer, also on ``next`` if there is one.
+    As a module or in a replay buffer, it also writes the input of ``next``, if there is one.
 
     Args:
         curriculum: the stages.
@@ -379,7 +379,7 @@ class ZeroPad(_StageTransform):
         run: the run that all transitions belong to, in batches of any shape; None if the first
             dimension is R equal blocks, in the order of the runs.
         keys: keys of observation and desired goal, which are read.
-        input_key: written.
+        input_key: key of the network's input, which is written.
         stage_key: key of the stage [..., 1] that each row carries, if episodes have stages of their own
             (:class:`~torchrl_her.curriculum.EpisodeStages`).
 
@@ -456,7 +456,7 @@ class ZeroPad(_StageTransform):
     def _pad(self, observation: Tensor, goal: Tensor, stage: Tensor | None) -> Tensor:
         if stage is None:
             self._check_blocks(observation.shape)
-            if len(stages := self._stages()) == 1:  # slices: an index would take several times as long
+            if len(stages := self._stages()) == 1:  # slicing takes a fraction of the time of indexing
                 size = len(self.curriculum.stages[stages[0]].observation)
                 unused = observation.new_zeros(*observation.shape[:-1], observation.shape[-1] - size)
                 return torch.cat((observation[..., :size], goal, unused), -1)

@@ -16,8 +16,9 @@ class StageView:
     """Converts transitions of any stage to another stage: its observation, goals, reward and ends.
 
     With it, a :class:`~torchrl_her.replay_buffers.StageRule` trains a stage on the transitions of all stages.
-    Transitions that were played in the stage stay as they are. The others get the reward and the end of the
-    stage. If their episode ended where it would continue in the stage, it is truncated. Luo et al., Relay
+    Transitions that were played in the stage stay as they are. The others get the reward of the stage and
+    terminate by its rule. If their episode ended where the stage's would continue, it is truncated. Luo et
+    al., Relay
     Hindsight Experience Replay, 2022 (arXiv 2208.00843).
 
     Args:
@@ -65,7 +66,7 @@ class StageView:
         self._keys = options.transition_keys()
 
     def __call__(self, rows: TensorDictBase) -> TensorDictBase:
-        """Returns transitions [n] of any stages as this stage shows them; the given ones stay as they are.
+        """Returns copies of transitions [n] of any stages, as this stage shows them.
 
         Raises:
             KeyError: an entry is missing.
@@ -78,7 +79,7 @@ class StageView:
         next_keys = (under_next(self.observation_key), keys.next_achieved, keys.goals[1])
         for state_key, names in ((self.state_key, current_keys), (under_next(self.state_key), next_keys)):
             entries = self.curriculum.show(entry_of(rows, state_key), self.stage)
-            for key, entry in zip(names, entries, strict=True):  # the stage's own rows keep proposed goals
+            for key, entry in zip(names, entries, strict=True):  # the stage's own rows keep their goals
                 out.set(key, torch.where(played, entry_of(rows, key), entry))
         for key in (keys.stage, under_next(keys.stage)):
             if (stages := out.get(key, None)) is not None:

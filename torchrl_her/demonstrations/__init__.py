@@ -1,4 +1,4 @@
-"""Learning from demonstrations: their file, their rows beside a run's own, and starts of episodes at them."""
+"""Learning from demonstrations: recording them, replaying them, and starting episodes at their states."""
 
 from torchrl_her.demonstrations.dataset import Demonstrations
 from torchrl_her.demonstrations.play import demonstrate

@@ -1,4 +1,4 @@
-"""Demonstrations: whole episodes played by another policy, and their file."""
+"""Demonstrations: whole episodes played by another policy, with methods to save and load them."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _KIND = "demonstrations 1"
 
 @dataclass(frozen=True)
 class Demonstrations:
-    """Whole episodes, one after the other, with the task and the origin that they were recorded for.
+    """Whole recorded episodes, one after the other, with their task and their origin.
 
     Args:
         rows: [n], all transitions: ``observation``, ``achieved_goal``, ``desired_goal``, ``action``, and
@@ -37,14 +37,14 @@ class Demonstrations:
         lengths: [E] int64, transitions of each episode.
 
     Keyword Args:
-        states: the physical state of the environment before each transition, n rows each; None if the
-            environment has no states that it can be put in.
-        task: its name.
-        made_by: description of the policy or controller that played them, as plain data for users.
+        states: the physical state before each transition, as named tensors of n rows; None if the
+            environment cannot be set to a state.
+        task: name of the task.
+        made_by: description of the policy or controller that played the episodes, as plain data.
         achieved_reward: the reward of an achieved goal.
 
     Raises:
-        ValueError: an entry is missing, there is no episode, or lengths, ends or states do not fit.
+        ValueError: an entry is missing, there is no episode, or lengths, ends or states do not match rows.
 
     Example:
         >>> from torchrl_her_envs import make_controller, make_env
@@ -112,7 +112,7 @@ class Demonstrations:
         """Returns the episodes with the given numbers, in the given order.
 
         Args:
-            episodes: [m] int64, their numbers.
+            episodes: [m] int64, numbers of the episodes.
         """
         index = torch.as_tensor(episodes, dtype=torch.int64)
         lengths, begins = self.lengths[index], self.begins[index]
@@ -123,7 +123,7 @@ class Demonstrations:
         """Returns the transitions at the given rows, which form episodes of the given lengths.
 
         Args:
-            index: [m] int64, which transitions.
+            index: [m] int64, row of each transition.
             lengths: [e] int64, which sum to m.
 
         Keyword Args:
@@ -156,7 +156,7 @@ class Demonstrations:
         states: Mapping[str, Tensor] | None = None,
         **facts: Any,
     ) -> Demonstrations:
-        """Makes demonstrations of a rollout, environment after environment; the last episodes are truncated.
+        """Makes demonstrations from a rollout, environment by environment; unfinished episodes are truncated.
 
         Args:
             rollout: [N, T], time last.
@@ -164,7 +164,7 @@ class Demonstrations:
         Keyword Args:
             first: whether only the first episode of each environment counts.
             states: states of the environments before each step, [N, T, ...] each.
-            **facts: the other arguments of the class.
+            **facts: ``task``, ``made_by`` and ``achieved_reward``, as for the class.
 
         Raises:
             ValueError: an entry is missing.
@@ -226,8 +226,8 @@ class Demonstrations:
         """Reads a file that :meth:`save` wrote. Nothing in it is executed.
 
         Raises:
-            ValueError: the file is damaged, or holds something else.
-            OSError: it cannot be read.
+            ValueError: the file is damaged, or holds no demonstrations.
+            OSError: the file cannot be read.
 
         Example:
             >>> import tempfile
@@ -255,6 +255,6 @@ class Demonstrations:
 
 
 def check_free(path: str | Path, *, force: bool = False) -> None:
-    """Raises a ValueError if a file exists, unless ``force`` says that it may be overwritten."""
+    """Raises a ValueError if a file exists already, unless ``force`` is True."""
     if Path(path).exists() and not force:
         raise ValueError(f"{path} exists already: choose another name, or --force (force=True) to replace it")

@@ -1,4 +1,4 @@
-"""Playing episodes that become demonstrations."""
+"""Recording of demonstrations: plays episodes with a given policy."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase
 from torchrl_her.demonstrations.dataset import Demonstrations
 from torchrl_her.trainers.trainer import evaluate
 
-_COUNTED = ("key", "step", "episode")  # entries of the states that count time and random numbers
+_COUNTED = ("key", "step", "episode")  # counters and random keys, which are no physical state
 
 
 def demonstrate(
@@ -30,11 +30,11 @@ def demonstrate(
     ``world_state_dict``, which returns tensors with a row for each environment.
 
     Args:
-        env: batched, [N].
-        policy: chooses actions.
+        env: batch of N environments.
+        policy: sets the action in the TensorDict of a step.
 
     Keyword Args:
-        max_steps: maximum number of steps of an episode, T; one that is longer is truncated.
+        max_steps: maximum number of steps of an episode; a longer episode is truncated.
         achieved_reward: the reward of an achieved goal.
         **facts: ``task`` and ``made_by`` of :class:`~torchrl_her.demonstrations.Demonstrations`.
 

@@ -20,8 +20,9 @@ def write_demonstrations(
     """Writes demonstrations into a run's block of a buffer, relabeled as the buffer's writer does it.
 
     Args:
-        buffer: with a :class:`~torchrl_her.HERWriter`.
-        demonstrations: with the run's reward, see :func:`~torchrl_her.demonstrations.with_reward`.
+        buffer: buffer with a :class:`~torchrl_her.HERWriter`.
+        demonstrations: demonstrations with the run's reward; see
+            :func:`~torchrl_her.demonstrations.with_reward`.
 
     Keyword Args:
         run: index of the run.
@@ -55,11 +56,11 @@ class MixedReplay:
     """A replay buffer of a run's own transitions and one of demonstrations, sampled as one.
 
     In each batch the first rows are a run's own and the last ones demonstrations, which are marked by the
-    flag ``demonstration``. Entries that only one of the two has are left out. Importance weights are divided
-    by their mean within each part, so that demonstrations with a share of the rows have that share of the
-    weight. New priorities go to the buffer that a row came from.
+    flag ``demonstration``. Entries that only one of the buffers has are left out. Importance weights are
+    divided by their mean in each of the two parts: demonstrations then have the same share of the weight as
+    of the rows. New priorities go to the buffer that a row came from.
 
-    Transitions are written into the buffer ``collected``, whose writer and size this object has. A
+    New transitions are written into ``collected``; ``writer`` and ``len()`` are those of that buffer. A
     :class:`~torchrl_her.Trainer` takes this object in place of a buffer.
 
     Nair et al., Overcoming exploration in reinforcement learning with demonstrations, 2018 (arXiv
@@ -71,7 +72,7 @@ class MixedReplay:
 
     Keyword Args:
         share: fraction of each batch that is demonstrations.
-        batch_size: rows of a batch of one run, as the trainer has it.
+        batch_size: number of rows in a batch of one run, the same as the trainer's.
 
     Raises:
         ValueError: the share is not between 0 and 1, a batch has no room for both, or the buffers are for
@@ -116,7 +117,8 @@ class MixedReplay:
     def sample(self, batch_size: int) -> TensorDictBase:
         """Samples rows [R * S * B]: R equal blocks, one for each run, of S batches of B rows.
 
-        In ``index``, the rows of demonstrations are numbered from the capacity of the other storage on.
+        The ``index`` of a demonstration is its row plus the capacity of ``collected``, so that each row has
+        its own index.
         """
         steps, rest = divmod(batch_size, self.runs * self.batch_size)
         if rest or not steps:

@@ -13,13 +13,13 @@ from torchrl_her.goals.rewards import RewardFunction, call_reward, outcomes
 
 
 def with_reward(demonstrations: Demonstrations, reward_fn: RewardFunction) -> Demonstrations:
-    """Recomputes the rewards and ends of demonstrations: each ends where its goal terminates it first.
+    """Recomputes the rewards and ends of demonstrations; each is cut at the first step that terminates it.
 
     A demonstration that no longer terminates is truncated at its end. If it had terminated without achieving
-    its goal, as by a fall, it still terminates there.
+    its goal, as by a fall, it still terminates at that step.
 
     Args:
-        demonstrations: as recorded.
+        demonstrations: the recorded demonstrations.
         reward_fn: maps (achieved, desired) goals to (reward, terminated).
 
     Example:
@@ -70,8 +70,8 @@ def in_stage(
         demonstrations: of the full task; [observation | desired goal] is the curriculum's state.
         curriculum: its stages.
         stage: index of the stage, from 0.
-        task_reward: reward of the last stage, the full task, if the curriculum has none for it; as recorded
-            if None.
+        task_reward: reward of the full task, for a last stage without a threshold; None keeps the recorded
+            rewards.
 
     Raises:
         ValueError: observation and goal are not as wide as the curriculum's state.
@@ -95,7 +95,7 @@ def in_stage(
 
 
 def _until_first(end: Tensor, demonstrations: Demonstrations) -> tuple[Tensor, Tensor]:
-    """Returns the rows [m] up to the first end [n] of each episode, and the number of these, [E]."""
+    """Returns the rows [m] of each episode up to its first ``end`` (a mask [n]), and their number [E]."""
     episode, rows = demonstrations.episode, torch.arange(len(end))
     first = torch.full_like(demonstrations.lengths, len(end))
     first = first.scatter_reduce(0, episode[end], rows[end], "amin")

@@ -18,35 +18,35 @@ from torchrl_her.modules.noise import generator_states, set_generator_states
 class DemonstrationStarts(Transform):
     """Starts a fraction of the episodes at states of demonstrations, with the goals of the demonstrations.
 
-    At first episodes start a few steps before the end of a demonstration, so that the goal is near. When
-    enough of them achieve it, starts walk back, see :class:`~torchrl_her.demonstrations.WalkBack`. Such an
-    episode has the usual number of steps. All other episodes start as the environment starts them.
+    At first these episodes start a few steps before the end of a demonstration, so that the goal is near. If
+    enough of them achieve their goal, starts move back, see :class:`~torchrl_her.demonstrations.WalkBack`.
+    The episodes have the usual number of steps. All others start as the environment starts them.
 
     The environment below must have a method ``start_at(states, which)``, as this library's throwing and toy
-    tasks have (:meth:`torchrl_her_envs.BatchedEnv.start_at`). Put the transform first, right around
-    it. If a later transform changes what ends an episode, as :class:`~torchrl_her.StateToObs` does, put
-    :meth:`outcomes` behind that one.
+    tasks have (:meth:`torchrl_her_envs.BatchedEnv.start_at`). Put this transform first, directly around that
+    environment. If a later transform changes what ends an episode, as :class:`~torchrl_her.StateToObs`
+    does, put the transform that :meth:`outcomes` returns behind it.
 
-    The environments of R runs are R equal blocks of the batch. Each run has its own random numbers and walks
-    back by itself. Both are part of the ``state_dict``.
+    The environments of R runs are R equal blocks of the batch. Each run has its own random numbers, and
+    its starts move back independently. Both are part of the ``state_dict``.
 
     Args:
-        demonstrations: with physical states. Only those that achieve their goal are used. One for all runs,
-            or R of them.
+        demonstrations: demonstrations with physical states, for all runs, or a list of R, one for each run.
+            Only episodes that achieve their goal are used.
 
     Keyword Args:
-        share: fraction of the episodes.
+        share: fraction of the episodes that start at demonstrations.
         runs: R.
         generators: generators, one for each run, or None for torch's own.
         **walk: options of :class:`~torchrl_her.demonstrations.WalkBack`: ``width``, ``stride``,
             ``threshold`` and ``samples``.
 
     Attributes:
-        walk: how far starts have walked back.
+        walk: the :class:`WalkBack`, with each run's distance of starts from the end of a demonstration.
 
     Raises:
         ValueError: the share is outside of [0, 1], there are no states, or no demonstration achieves its
-            goal; when used, the environment cannot be started at a state, or is not R equal blocks.
+            goal; when used, the environment cannot be started at a state, or the batch is not R equal blocks.
 
     Example:
         >>> from torchrl.envs import TransformedEnv
@@ -85,7 +85,7 @@ class DemonstrationStarts(Transform):
         self._asks_elsewhere = False
 
     def show(self, demonstrations: Demonstrations, *, run: int = 0) -> None:
-        """Replaces the demonstrations of a run, for instance at its next stage, and restarts its walk."""
+        """Replaces a run's demonstrations, as in its next stage, and moves its starts near the end again."""
         self._shown[run] = usable(demonstrations)
         self.walk.restart(run, int(self._shown[run].lengths.max()))
 
@@ -143,7 +143,7 @@ class DemonstrationStarts(Transform):
         ):
             new = run_begun.nonzero().flatten()
             if len(new) == 0:
-                continue  # draws nothing, as when the run is trained alone
+                continue  # no numbers are drawn, so that a run draws the same ones beside other runs
             u = torch.rand(len(new), 3, generator=generator, dtype=torch.float64)
             started = u[:, 0] < self.share
             demonstrations, (least, most) = self._shown[run], self.walk.window(run)
@@ -178,7 +178,7 @@ class DemonstrationStarts(Transform):
     # Part of the state_dict, which collectors include in theirs
 
     def get_extra_state(self) -> dict[str, Any]:
-        """Returns the walk, the episodes under way, and the sources of random numbers."""
+        """Returns the state of :attr:`walk`, of the open episodes, and of the generators."""
         return {
             "walk": self.walk.state_dict(),
             "back": None if self._back is None else self._back.clone(),

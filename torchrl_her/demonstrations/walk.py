@@ -9,23 +9,23 @@ from torchrl_her.checks import check_whole
 
 
 class WalkBack:
-    """Starts of episodes that walk back from the ends of demonstrations, for each of R runs by itself.
+    """Moves starts of episodes back from the ends of demonstrations, independently for each of R runs.
 
     Salimans and Chen, Learning Montezuma's Revenge from a single demonstration, 2018 (arXiv 1812.03381);
     Florensa et al., Reverse curriculum generation for reinforcement learning, 2017 (arXiv 1707.05300).
 
     Args:
-        longest: R, transitions of the longest demonstration of each run.
+        longest: length of the longest demonstration of each run, in steps.
 
     Keyword Args:
         width: number of steps among which starts are drawn: from ``back - width + 1`` to ``back`` steps
             before the end.
-        stride: length of a step back.
-        threshold: share of successes at which starts move a step back.
-        samples: number of the latest episodes whose share of successes counts, all since the last step back.
+        stride: number of steps by which starts move back at once.
+        threshold: success rate at which starts move back.
+        samples: number of latest episodes for the success rate; all must have ended since the last move.
 
     Attributes:
-        back: R, the greatest number of steps before the end at which episodes start.
+        back: for each run, the greatest number of steps before the end at which episodes start.
 
     Raises:
         ValueError: a number is below 1, or the threshold is not in (0, 1].
@@ -62,18 +62,18 @@ class WalkBack:
 
     def record(self, run: int, outcomes: Sequence[bool]) -> None:
         """Records whether episodes of a run that started at demonstrations achieved their goal."""
-        for outcome in outcomes:  # one by one: any of them may complete a step back
+        for outcome in outcomes:  # one by one: starts may move back after each of them
             latest = [*self._outcomes[run], outcome][-self.samples :]
             if len(latest) == self.samples and sum(latest) >= self.threshold * self.samples:
                 self.back[run], latest = min(self._longest[run], self.back[run] + self.stride), []
             self._outcomes[run] = latest
 
     def restart(self, run: int, longest: int) -> None:
-        """Restarts a run's walk, for other demonstrations."""
+        """Moves a run's starts near the end again, for other demonstrations."""
         self._longest[run], self.back[run], self._outcomes[run] = longest, min(self.width, longest), []
 
     def state_dict(self) -> dict[str, Any]:
-        """Plain data that :meth:`load_state_dict` takes."""
+        """Returns distances, outcomes and lengths of all runs, as plain data."""
         outcomes = [list(run_outcomes) for run_outcomes in self._outcomes]
         return {"back": list(self.back), "outcomes": outcomes, "longest": list(self._longest)}
 
@@ -81,7 +81,7 @@ class WalkBack:
         """Restores the state that :meth:`state_dict` returned.
 
         Raises:
-            ValueError: it is of another number of runs.
+            ValueError: the state has another number of runs.
         """
         if len(state["back"]) != len(self.back):
             raise ValueError(f"the state is of {len(state['back'])} runs, not of {len(self.back)}")

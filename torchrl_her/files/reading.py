@@ -19,14 +19,14 @@ from zipfile import ZIP_STORED, ZipFile
 import torch
 from torch import Tensor, nn
 
-_STEPS = 1 << 22  # opcodes of a pickle: to check them takes a few hundred megabytes at most
+_STEPS = 1 << 22  # most opcodes of a pickle: checking so many takes a few hundred megabytes
 _DEPTH = 100
-_REPEATED = 1 << 24  # most elements that tensors may have beyond their storages, as expanded views do
-# The last bytes of an archive of torch.save. They give the size and the place of the directory, and the place
-# of what follows it. Other readers of archives disagree on where the directory is if these do not fit.
+_REPEATED = 1 << 24  # most elements by which tensors may exceed their storages, as expanded views do
+# The last bytes of an archive by torch.save: size and place of the directory, and place of what follows it.
+# If these contradict each other, zipfile and torch may read different directories.
 _END = struct.Struct("<4s36xQQ4s4xQ4x4s16xH")
 _MARKS = (b"PK\6\6", b"PK\6\7", b"PK\5\6")
-# torch looks records up without regard to case; numbers have none, so each record has one name.
+# torch ignores case in the names of records, so the names that hold tensors must be numbers.
 _RECORD = re.compile(r"[^/\0]+/(data\.pkl|data/[0-9]+|\.?\w+|\.data/\w+)", re.ASCII)
 _NAMES = {
     "collections OrderedDict",
@@ -38,9 +38,9 @@ _NAMES = {
     *(f"torch {name}" for name in dir(torch) if name.endswith("Storage")),
     *(f"torch {name}" for name in dir(torch) if isinstance(getattr(torch, name), torch.dtype)),
 }
-_NAME, _STORAGE = -1, 6  # sizes: of a name, and of ("storage", type, key, device, count)
+_NAME, _STORAGE = -1, 6  # sizes of a name and of the tuple ("storage", type, key, device, count)
 _SIZES = {"GLOBAL": _NAME, "BINPERSID": _STORAGE}
-_NEEDS = {"REDUCE": _NAME, "NEWOBJ": _NAME, "BINPERSID": _STORAGE}  # operands of each step
+_NEEDS = {"REDUCE": _NAME, "NEWOBJ": _NAME, "BINPERSID": _STORAGE}  # size of an opcode's first operand
 _PLAIN = (bool, int, float, str, type(None), torch.dtype, dict, list, tuple)
 
 
@@ -49,14 +49,14 @@ class MoreThanDataError(ValueError):
 
 
 def read_tensors(path: str | Path) -> Any:
-    """Returns what ``torch.save`` wrote, if it is tensors and plain data.
+    """Returns the tensors and plain data that ``torch.save`` wrote; refuses all else.
 
     Args:
         path: the file.
 
     Raises:
-        ValueError: the file is damaged or holds something else; the message names it.
-        OSError: it cannot be read.
+        ValueError: the file is damaged, or holds something else, which the message names.
+        OSError: the file cannot be read.
 
     Example:
         >>> import tempfile
@@ -84,8 +84,8 @@ def load_tensors(file: BinaryIO, *, map_location: torch.device | str = "cpu") ->
         map_location: Device of the loaded tensors.
 
     Raises:
-        MoreThanDataError: the file names something else; the message continues "the file holds".
-        ValueError: it is damaged; the message continues "the file cannot be read:".
+        MoreThanDataError: the file holds something else; the message is to follow "the file holds".
+        ValueError: the file is damaged; the message is to follow "the file cannot be read:".
     """
     begin = file.tell()
     try:
@@ -95,7 +95,7 @@ def load_tensors(file: BinaryIO, *, map_location: torch.device | str = "cpu") ->
         file.seek(begin)
         loaded = torch.load(file, map_location="cpu", weights_only=True, mmap=False)
         _check_tree(loaded)
-        if torch.device(map_location).type != "cpu":  # where storages may grow to any declared size
+        if torch.device(map_location).type != "cpu":  # where storages may take any declared size
             file.seek(begin)
             loaded = torch.load(file, map_location=map_location, weights_only=True, mmap=False)
         return loaded
@@ -110,7 +110,7 @@ class _RefusedError(ValueError):
 
 
 def _check_archive(file: BinaryIO, begin: int) -> None:
-    """Refuses an archive with records that are compressed, strange, or larger than the file."""
+    """Refuses an archive with records that are compressed, unknown, or larger than the file."""
     end = file.seek(0, 2)
     place = max(0, end - begin - _END.size)
     file.seek(begin + place)
@@ -132,14 +132,15 @@ def _check_archive(file: BinaryIO, begin: int) -> None:
 
 
 def _check_description(description: bytes) -> None:
-    """Refuses a pickle that names or calls anything but makers of tensors, or nests tuples without end.
+    """Refuses a pickle that calls anything but constructors of tensors, or whose tuples expand too far.
 
-    A tuple that has the same tuple twice, which has another one twice, and so on, takes few bytes, but its
-    hash takes time for all entries written out. Lists have no hash, but torch prints them in an error.
+    A tuple that holds a second tuple twice, which holds a third one twice, and so on, takes few bytes, but
+    hashing it takes time for all entries written out. Printing such lists in an error would, too, so the
+    operands that torch would print are checked.
 
     Raises:
-        MoreThanDataError: it names something else.
-        ValueError: it is damaged, or too large with all tuples written in full.
+        MoreThanDataError: the pickle names something else.
+        ValueError: the pickle is damaged, or too large with all tuples written in full.
     """
     stack: list[int] = []  # sizes of values; the size of a tuple is the sum over its entries
     marks: list[int] = []
@@ -175,7 +176,7 @@ def _check_description(description: bytes) -> None:
 
 
 def _check_tree(loaded: Any) -> None:
-    """Refuses values that are not plain data, and tensors that are far larger than their storages."""
+    """Refuses values that are not plain data, and views with far more elements than their storages."""
     repeated = 0
     for count, value in enumerate(_values(loaded)):
         if type(value) in (Tensor, nn.Parameter):

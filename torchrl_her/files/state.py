@@ -13,7 +13,7 @@ _NAME = "state.pt"
 
 
 class StateFile:
-    """Writes the ``state_dict`` of a part, all tensors and plain data, to a file; for TorchRL's ``dumps``."""
+    """Base class whose ``dumps`` saves the ``state_dict`` of a part of a replay buffer in one file."""
 
     def dumps(self: Any, path: str | Path) -> None:
         """Writes the state into a folder, which is made if its parent exists."""

@@ -1,4 +1,4 @@
-"""Writing files whole or not at all."""
+"""Writes files whole or not at all."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ def part_of(path: Path) -> Path:
 def written(path: str | Path) -> Iterator[Path]:
     """Replaces a file atomically: even after a loss of power it is either the new or the old one.
 
-    Gives the path to write to, beside the file. At the end what was written there is synced to the disk and
-    takes the file's place; after an error it is removed.
+    Yields a temporary path to write to. At the end, the temporary file is synced to the disk and replaces the
+    file; after an error it is removed.
 
     Args:
         path: the file.
 
     Raises:
-        OSError: it cannot be written; the one before is untouched.
+        OSError: the file cannot be written; its old content is untouched.
 
     Example:
         >>> import tempfile
@@ -59,7 +59,7 @@ def write_text(path: str | Path, text: str) -> None:
     """Writes a text in UTF-8 and keeps its line endings.
 
     Raises:
-        OSError: the file cannot be written; the one before is untouched.
+        OSError: the file cannot be written; its old content is untouched.
     """
     with written(path) as part:
         part.write_text(text, encoding="utf-8", newline="")

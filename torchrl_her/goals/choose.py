@@ -16,9 +16,9 @@ from torchrl_her.goals.factors import between, combine, draw, draw_uniformly, dr
 from torchrl_her.goals.weights import checked_weights
 from torchrl_her.randomness import RunDraws
 
-# Likelihoods of goals [transitions, W] that are held in memory at once.
+# Greatest number of likelihoods [transitions, W] that are computed at once, to bound memory.
 LIKELIHOODS = 1 << 17
-# How often refused goals are proposed again where lines are long.
+# How often goals that the filter refuses are drawn anew if lines are long.
 TRIES = 8
 
 Index = Tensor | slice
@@ -29,7 +29,7 @@ class Candidates(NamedTuple):
     """Goals that transitions [n] may take, before weights and filter.
 
     Attributes:
-        goals: [p, g].
+        goals: [p, g], the goals of all lines.
         table: [L, W] int64, positions in ``goals``; shorter lines are padded with their last position.
         line: [n] int64, ascending: the line of each transition.
         first, end: [n] int64: which places of its line a transition may take, ``first <= place < end``.
@@ -77,7 +77,7 @@ def choose_goals(
 
     Returns:
         ``(position, valid)``, [n, k] each: int64, positions in ``candidates.goals``, and bool, False where a
-        position is meaningless: no goal may be drawn, or the one that was drawn is left out.
+        position is meaningless: no goal may be drawn, or the drawn one was refused.
 
     Raises:
         ValueError: weights are negative or not finite.
@@ -160,7 +160,7 @@ def _propose(candidates: Candidates, k: int, weight: Tensor | None, draws: RunDr
         return x.new_zeros(len(counts), longest, *x.shape[1:]).index_put_((line, place), x)
 
     def numbers(_: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
-        """Returns random numbers, none for padding: draws must not depend on the length of other lines."""
+        """Returns random numbers; draws none for padding, whose number depends on the other lines."""
         return by_line(draws((n, k), dtype, device))
 
     drawn = draw_weighted(weight, by_line(first), by_line(end), k, generator=numbers)

@@ -1,6 +1,6 @@
 """Logarithms of densities of goals in any number of dimensions, estimated from samples.
 
-In 30 dimensions densities span hundreds of orders of magnitude, which only their logarithms can hold.
+In 30 dimensions densities span hundreds of orders of magnitude, too many for floating-point numbers.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ _FARTHEST = 1e140  # coordinates, in sigmas, beyond which squares of float64 wou
 def goal_scale(samples: Tensor) -> Tensor:
     """Returns the standard deviations [g] of samples [n, g], to scale goals of different units.
 
-    None is below a hundredth of the greatest, since otherwise a coordinate that hardly varies would make all
-    goals rare. All are 1 if nothing varies.
+    Deviations are at least a hundredth of the greatest one, since otherwise a coordinate that hardly varies
+    would make all goals rare. All are 1 if nothing varies.
 
     Example:
         >>> goal_scale(torch.tensor([[0.0, 5.0], [4.0, 5.0]])).tolist()
@@ -41,13 +41,14 @@ def log_kernel_density(points: Tensor, samples: Tensor, sigma: Numbers) -> Tenso
     Args:
         points: [..., g], where the density is wanted.
         samples: [n, g] goals of the distribution, n at least 1.
-        sigma: standard deviation of the kernel, in the unit of the goals; or g of them.
+        sigma: standard deviation of the kernel, in the unit of the goals; one number, or one for each
+            dimension.
 
     Returns:
         [...] of float64: finite, however far a point is away; NaN where a point has NaN or infinity.
 
     Raises:
-        ValueError: shapes do not fit, samples are not finite, or sigma is not positive and finite.
+        ValueError: shapes do not match, samples are not finite, or sigma is not positive and finite.
 
     Example:
         >>> log_kernel_density(torch.tensor([[0.0], [2.0]]), torch.tensor([[0.0]]), 2.0).exp()
@@ -56,7 +57,7 @@ def log_kernel_density(points: Tensor, samples: Tensor, sigma: Numbers) -> Tenso
     flat, known = _checked(points, samples)
     scale = _scale(sigma, known)
     center = known.mean(0)  # near 0 sums of squares lose the fewest digits
-    # NaN and infinity are marked below. Clamped, as squares would overflow to infinity minus infinity.
+    # Clamped, since squares would overflow to infinity minus infinity; NaN and infinity are marked below.
     flat = ((flat - center) / scale).clamp_(-_FARTHEST, _FARTHEST)
     known = ((known - center) / scale).clamp_(-_FARTHEST, _FARTHEST)
     parts = [_log_sum(part, known) for part in flat.split(max(1, _CHUNK // len(known)))]
@@ -66,7 +67,7 @@ def log_kernel_density(points: Tensor, samples: Tensor, sigma: Numbers) -> Tenso
 
 
 def log_neighbor_density(points: Tensor, samples: Tensor, k: int, *, least_distance: float = 1e-6) -> Tensor:
-    """Returns the log of a nearest-neighbor density: k / n in the ball up to the k-th nearest sample.
+    """Returns the log of a nearest-neighbor density: k / n over the volume up to the k-th nearest sample.
 
     Loftsgaarden and Quesenberry, A nonparametric estimate of a multivariate density function, 1965. The ball
     grows where samples are few, so this estimate needs no width and remains of use in many dimensions.
@@ -77,17 +78,17 @@ def log_neighbor_density(points: Tensor, samples: Tensor, k: int, *, least_dista
         k: from 1 to n; the distance to the k-th nearest sample gives the density.
 
     Keyword Args:
-        least_distance: distances below this count as this, in the unit of the goals: at k equal samples the
-            density would be infinite.
+        least_distance: smaller distances are raised to this, in the unit of the goals: where k samples are
+            equal, the density would be infinite.
 
     Returns:
         [...] of float64: finite, however far a point is away; NaN where a point has NaN or infinity.
 
     Raises:
-        ValueError: shapes do not fit, samples are not finite, or an option is out of its range.
+        ValueError: shapes do not match, samples are not finite, or an option is out of its range.
 
     Example:
-        >>> samples = torch.tensor([[0.0], [1.0], [4.0]])  # the second one is 2 away from 2
+        >>> samples = torch.tensor([[0.0], [1.0], [4.0]])  # the second nearest to 2 is at distance 2
         >>> log_neighbor_density(torch.tensor([[2.0]]), samples, 2).exp()  # 2 of 3 samples in [0, 4]
         tensor([0.1667], dtype=torch.float64)
     """

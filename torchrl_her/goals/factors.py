@@ -17,7 +17,7 @@ from torch import Tensor
 
 from torchrl_her.goals.strategies import Strategy, candidate_range
 
-# A generator, or a function that gives uniform numbers in [0, 1) of a shape, type and device.
+# A generator, or a function that returns uniform numbers in [0, 1) for a shape, dtype and device.
 Randomness = torch.Generator | Callable[[tuple[int, ...], torch.dtype, torch.device], Tensor] | None
 
 
@@ -30,7 +30,8 @@ def candidates(strategy: Strategy, lengths: Tensor, horizon: int) -> Tensor:
         horizon: T, the length to which they are padded.
 
     Returns:
-        [..., T, T] of bool, indexed by (t, t'); False wherever t or t' is padding.
+        Mask [..., T, T], indexed by (t, t'): whether transition t may take the goal that t' achieved;
+        False wherever t or t' is padding.
 
     Raises:
         ValueError: an unknown strategy, or one that leaves the episode.
@@ -59,7 +60,8 @@ def combine(candidate: Tensor, weight: Tensor | None = None, keep: Tensor | None
         keep: [..., T] of bool, the filter; None to keep all. All three arguments are broadcast together.
 
     Returns:
-        [..., T] of float.
+
+        Likelihoods [..., T], which are floating-point numbers.
 
     Example:
         >>> combine(torch.tensor([[True, True], [False, True]]), torch.tensor([1.0, 3.0])).tolist()
@@ -88,10 +90,10 @@ def draw_uniformly(first: Tensor, end: Tensor, k: int, *, generator: Randomness 
         first: [...] int64, the first candidate.
         end: [...] int64, one more than the last candidate; above ``first``.
         k: number of draws.
-        generator: source of the random numbers; or a function that gives them, of a shape, type and device.
+        generator: source of the random numbers, or a function (shape, dtype, device) that returns them.
 
     Returns:
-        [..., k] of int64, the transition that achieved the goal.
+        Steps [..., k] int64 of the transitions that achieved the drawn goals.
 
     Example:
         >>> draw_uniformly(torch.tensor([5, 7]), torch.tensor([6, 8]), 3).tolist()
@@ -110,15 +112,15 @@ def draw_weighted(
     weights. No table is made: all transitions of an episode look up their draws in the same running sum.
 
     Args:
-        weight: [..., T], at least 0, of each goal of an episode.
+        weight: [..., T], the weight of each goal of an episode, at least 0.
         first: [..., n] int64, the first candidate of each transition.
         end: [..., n] int64, one more than the last candidate; above ``first``.
         k: number of draws.
-        generator: source of the random numbers; or a function that gives them, of a shape, type and device.
+        generator: source of the random numbers, or a function (shape, dtype, device) that returns them.
 
     Returns:
-        [..., n, k] of int64, the transition that achieved the goal. Where all candidates have weight 0
-        one of them is drawn nevertheless, so check the weights of what was drawn.
+        Steps [..., n, k] int64 of the transitions that achieved the drawn goals. If all candidates have
+        weight 0, one of them is drawn nevertheless, so check the weights of drawn goals.
 
     Example:
         >>> weight = torch.tensor([1.0, 0.0, 2.0, 5.0])
@@ -130,7 +132,7 @@ def draw_weighted(
     low, high = cumulative.gather(-1, first), cumulative.gather(-1, end)
     u = _uniform((*first.shape, k), cumulative.dtype, first.device, generator)
     mass = low.unsqueeze(-1) + u * (high - low).unsqueeze(-1)
-    # 32 bits are enough, and take half the time
+    # 32-bit indices are enough, and take half the time
     index = torch.searchsorted(cumulative, mass.flatten(-2), right=True, out_int32=True).view_as(mass)
     # rounding may move u * mass beyond the last candidate whose weight is not 0
     low, high = (bound.int().unsqueeze(-1) for bound in (first + 1, end))
@@ -143,12 +145,12 @@ def draw(likelihood: Tensor, k: int, *, generator: Randomness = None) -> tuple[T
     Args:
         likelihood: [..., T], at least 0, from :func:`~torchrl_her.goals.combine`.
         k: number of draws.
-        generator: source of the random numbers; or a function that gives them, of a shape, type and device.
+        generator: source of the random numbers, or a function (shape, dtype, device) that returns them.
 
     Returns:
-        ``(index, valid)``: [..., k] of int64, the transition that achieved the goal, and [...] of
-        bool, False where all candidates of a transition have likelihood 0 (its indices are then
-        meaningless).
+        ``(index, valid)``: steps [..., k] int64 of the transitions that achieved the drawn goals, and bool
+        [...], False where all candidates of a transition have likelihood 0, so that its indices are
+        meaningless.
 
     Example:
         >>> index, valid = draw(torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, 0.0]]), 2)

@@ -32,7 +32,7 @@ class GoalGrid:
 
     Args:
         low, high: d numbers each, corners of the box, in the unit of the goals.
-        shape: d numbers of cells.
+        shape: number of cells along each of the d dimensions.
 
     Keyword Args:
         warn: whether to warn, once, when a goal lies farther outside of the box than a cell is wide.
@@ -110,7 +110,7 @@ class GoalGrid:
         goal = goals[near.int().argmin()].tolist()
         warnings.warn(
             f"goal {goal} lies outside the grid's box, low={self.low}, high={self.high}; "
-            "such goals are counted in the cells at its edge (this is said once)",
+            "such goals are counted in the cells at its edge (this warning appears once)",
             stacklevel=3,
         )
 
@@ -119,18 +119,18 @@ def box_target(grid: GoalGrid, low: Numbers, high: Numbers, sigma: Numbers, *, n
     """Computes the target q* for goals that are uniform in a box, in closed form. Equations 4.3 and 4.7.
 
     The integral over a box is a product of differences of the normal distribution function. If
-    sigma is so small that every cell's mass underflows, the cells nearest to the box get all of it.
+    sigma is so small that every cell's mass underflows, the cells nearest to the box get all the mass.
 
     Args:
         grid: grid of cells over all virtual goals.
         low, high: d numbers each, corners of the box of real goals.
-        sigma: standard deviation of the Gaussian kernel, in the unit of the goals; or d of them.
+        sigma: standard deviation of the Gaussian kernel, in the unit of the goals; one number, or d of them.
 
     Keyword Args:
         name: name of the task or stage; error messages begin with it.
 
     Returns:
-        [cells] of float64, sums to 1.
+        q* [cells], float64, with a sum of 1.
 
     Raises:
         ValueError: the box has no volume, or sigma is not positive and finite.
@@ -154,8 +154,8 @@ def box_target(grid: GoalGrid, low: Numbers, high: Numbers, sigma: Numbers, *, n
 def _log_mass(x: Tensor, low: float, high: float, sigma: float) -> Tensor:
     """Returns the log of a normal kernel's integral over [low, high], around each x [n], up to a constant.
 
-    A factor exp(-near^2 / 2) is kept apart from each mass, near being the distance to the box, since
-    it would underflow.
+    The factor exp(-near^2 / 2), where near is the distance to the box, would underflow, so only its logarithm
+    is added.
     """
     left, right, width = (x - low) / sigma, (high - x) / sigma, (high - low) / sigma
     near = (-torch.minimum(left, right)).clamp_min(0)
@@ -174,7 +174,7 @@ def _sigmas(grid: GoalGrid, sigma: Numbers, label: str = "") -> list[float]:
     sigmas, d = _floats(sigma), len(grid.shape)
     if len(sigmas) not in (1, d) or not all(0 < s < math.inf for s in sigmas):
         raise ValueError(f"{label}sigma must be positive and finite, a scalar or of length {d}, got {sigma}")
-    # Beyond these bounds q* is one cell, or uniform, whatever sigma is, and squares would overflow.
+    # Beyond these bounds sigma hardly changes q* (one cell, or uniform), and squares would overflow.
     dimensions = zip(sigmas * d if len(sigmas) == 1 else sigmas, grid.cell_size, grid.shape, strict=True)
     return [min(max(s, 1e-12 * size), 1e12 * size * n) for s, size, n in dimensions]
 
@@ -185,10 +185,10 @@ def sampled_target(grid: GoalGrid, samples: Tensor, sigma: Numbers) -> Tensor:
     Args:
         grid: grid of cells over all virtual goals.
         samples: [n, d] real goals.
-        sigma: standard deviation of the Gaussian kernel, in the unit of the goals; or d of them.
+        sigma: standard deviation of the Gaussian kernel, in the unit of the goals; one number, or d of them.
 
     Returns:
-        [cells] of float64, sums to 1; the error shrinks as 1 / sqrt(n).
+        q* [cells], float64, with a sum of 1; its error shrinks as 1 / sqrt(n).
 
     Raises:
         ValueError: there are no samples, some are not finite or of another shape, or sigma is not positive.
@@ -220,7 +220,7 @@ def kl_divergence(q: Tensor, q_star: Tensor) -> Tensor:
         q, q_star: [..., cells], each sums to 1.
 
     Returns:
-        [...]
+        Divergences [...].
 
     Example:
         >>> kl_divergence(torch.tensor([0.5, 0.5, 0.0]), torch.tensor([0.25, 0.25, 0.5]))

@@ -1,4 +1,4 @@
-"""IBS: a goal's weight is its instructiveness, the target q* minus the proposal q.
+"""IBS: a goal's weight is its instructiveness, the target density q* minus the density q of virtual goals.
 
 Equations are those of chapter 4 (Instructional Based Strategy) of the thesis that the method is from.
 """

@@ -1,4 +1,4 @@
-"""Base of all IBS weights: the schedule of the kernel's sigma, and their options."""
+"""Base class of all IBS weights, with their options and the schedule of the kernel's sigma."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ class InstructiveWeights(GoalWeights):
         subtract: False for the weights q* alone, without q and floor (the sequential architecture).
 
     Attributes:
-        sigma: its present value.
-        final_sigma: its value at the end of the schedule.
+        sigma: present standard deviation of the kernel.
+        final_sigma: standard deviation at the end of the schedule.
 
     Raises:
         ValueError: an option is out of its range.

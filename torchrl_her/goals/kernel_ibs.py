@@ -27,8 +27,8 @@ class KernelInstructiveness(InstructiveWeights):
     Goals that are not finite have weight 0.
 
     Args:
-        goals: [n, g], goals as the task asks for them. If there are more than ``samples``, some of them,
-            spread evenly, are used.
+        goals: [n, g], desired goals drawn from the task. If there are more than ``samples``, an evenly spread
+            part of them is used.
 
     Keyword Args:
         sigma: the final standard deviation of the kernel, in the unit of the goals divided by ``scale``.
@@ -53,7 +53,7 @@ class KernelInstructiveness(InstructiveWeights):
         >>> weights(torch.cat([real, real + 3.0]))
         tensor([1.0000, 1.0000, 0.0253, 0.0020])
         >>> weights.update(real[:1])
-        >>> weights(real).round(decimals=3)  # the first one has had more than its share
+        >>> weights(real).round(decimals=3)  # at the first goal q exceeds q*
         tensor([0.0020, 0.3940])
     """
 
@@ -90,11 +90,11 @@ class KernelInstructiveness(InstructiveWeights):
     def divergence(self) -> float:
         """KL(q || q*) in nats of the two kernel densities at the final sigma, a mean over goals from q.
 
-        It is 0 if virtual goals lie as the real ones do; NaN before the first write.
+        It is 0 if virtual goals are distributed like the real ones; NaN before the first write.
         """
         if len(self._virtual) == 0:
             return math.nan
-        generator = torch.Generator().manual_seed(0)  # the same goals at each call, on whatever device q is
+        generator = torch.Generator().manual_seed(0)  # the same goals in each call, on any device
         noise = torch.randn(self._virtual.shape, dtype=torch.float64, generator=generator)
         self._move(self._virtual.device)
         goals = self._virtual + self.final_sigma * self._scale * noise.to(self._virtual.device)
@@ -119,12 +119,12 @@ class KernelInstructiveness(InstructiveWeights):
     def update(self, goals: Tensor) -> None:
         """Adds virtual goals to q.
 
-        A goal's key is the fractional part of its number times the golden ratio, and goals with the least
-        keys stay. Such keys are spread evenly over any range of numbers, so the goals that stay are spread
-        over all that were written so far.
+        Each goal gets a key, the fractional part of its index times the golden ratio, and goals with the
+        least keys stay. Such keys are spread evenly over any range of indices, so the goals that stay are
+        spread over all that were written so far.
         """
         if self.is_uniform and goals.shape[-1] != self._real.shape[1]:
-            return  # goals of a stage that is not instructive
+            return  # a stage without IBS may have goals of another width
         self._check(goals)
         goals = goals.detach().reshape(-1, goals.shape[-1])
         goals = goals[goals.isfinite().all(-1)]

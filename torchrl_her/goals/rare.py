@@ -17,7 +17,7 @@ Estimator = Literal["kernel", "neighbors"]
 
 _LEVEL = 128  # number of samples; the median of their densities is the density of an ordinary goal
 _LEAST_DISTANCE = 1e-3  # in standard deviations: nearer goals count as equal
-_SHARPEST = 3.0  # dimensions from which on the default of sharpness falls
+_SHARPEST = 3.0  # beyond this many dimensions, the default of sharpness falls
 
 
 class RareGoals(GoalWeights):
@@ -38,13 +38,13 @@ class RareGoals(GoalWeights):
         k: with ``"neighbors"``, the distance to the k-th nearest goal gives the density.
         sharpness: weights are ``density ** -sharpness``; None for 1 up to three dimensions and 3 / g beyond,
             since the same ratio of distances is a far greater ratio of densities there.
-        limit: largest ratio between the weight of a goal and the weight of a goal of median density, and the
-            inverse of the least ratio.
+        limit: a goal's weight is at most ``limit`` times the weight at median density, and at least that
+            weight divided by ``limit``.
         memory: number of the newest goals that are remembered.
         samples: number of these from which densities are estimated; they are spread evenly over the memory.
 
     Attributes:
-        goals: [n, g], those remembered, in no particular order; None if there are none.
+        goals: [n, g], the remembered goals, in no particular order; None if there are none.
 
     Raises:
         ValueError: an option is out of its range, or goals have another width than those remembered.
@@ -52,7 +52,7 @@ class RareGoals(GoalWeights):
     Example:
         >>> weights = RareGoals(estimator="neighbors", k=2)
         >>> weights.update(torch.tensor([[0.0], [1.0], [2.0], [9.0]]))
-        >>> weights(torch.tensor([[0.5], [9.0]]))  # the second nearest is 0.5 away, and 7
+        >>> weights(torch.tensor([[0.5], [9.0]]))  # the second nearest goals are at distances 0.5 and 7
         tensor([0.0714, 1.0000])
     """
 
@@ -95,7 +95,7 @@ class RareGoals(GoalWeights):
         return normalized_weights(((level - logs) * sharpness).clamp(-bound, bound), goals)
 
     def update(self, goals: Tensor) -> None:
-        """Adds goals to the memory; of more than fit, a part that is spread evenly over them."""
+        """Adds goals to the memory; of more goals than ``memory``, an evenly spread part."""
         goals = goals.detach().reshape(-1, goals.shape[-1])
         goals = goals[goals.isfinite().all(-1)]
         new = goals[spread_evenly(len(goals), self.memory, goals.device)]
@@ -145,7 +145,7 @@ class RareGoals(GoalWeights):
 
 
 class _Reference(NamedTuple):
-    """Points that densities are estimated from."""
+    """Goals from which densities are estimated, and the median density."""
 
     samples: Tensor  # [n, g] of float64, goals divided by their scale
     scale: Tensor  # [g] of float64

@@ -1,4 +1,4 @@
-"""Goals as points: their distance, whether one is achieved, and the sparse reward."""
+"""Reward functions of goals, and functions that call reward functions and check their results."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _FORM = (
     "the reward function must take (achieved_goal, desired_goal) and return (reward, terminated), "
     "tensors [..., 1]; one that reads further entries comes as EnvReward(function, info_keys=[...])"
 )
-# Achieved goals [..., g]; or goals and info, for a reward function that reads further entries.
+# Achieved goals [..., g], or a tensordict of goals and info if the reward function reads further entries.
 Outcome: TypeAlias = Tensor | TensorDictBase
 _LOOKED_AT = 100  # number of infos that are tried to see whether goals end episodes
 
@@ -43,7 +43,7 @@ def distance(achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
         desired_goal: [..., g], broadcast against ``achieved_goal``.
 
     Returns:
-        [...]
+        Distances [...].
 
     Example:
         >>> distance(torch.tensor([0.0, 3.0]), torch.tensor([4.0, 0.0]))
@@ -61,7 +61,7 @@ def achieved(achieved_goal: Tensor, desired_goal: Tensor, threshold: float) -> T
         threshold: in the unit of the goals.
 
     Returns:
-        [...] of bool.
+        Mask [...] of achieved goals.
     """
     if not achieved_goal.is_floating_point():  # squares of int8, for example, overflow
         achieved_goal, desired_goal = achieved_goal.float(), desired_goal.float()
@@ -106,13 +106,13 @@ class EnvReward:
     """An environment's own functions as a :class:`~torchrl_her.goals.RewardFunction`.
 
     Args:
-        compute_reward: (achieved, desired) goals [..., g] to rewards [..., 1].
-        compute_terminated: (achieved, desired) goals [..., g] to bool [..., 1]: where the episode terminates.
-            If None, no goal terminates it.
+        compute_reward: maps (achieved, desired) goals [..., g] to rewards [..., 1].
+        compute_terminated: maps (achieved, desired) goals [..., g] to bool [..., 1]: whether the episode
+            terminates. If None, no goal terminates an episode.
 
     Keyword Args:
-        info_keys: further entries of the transition that both functions read. They get them as a third
-            argument, see :class:`~torchrl_her.goals.RewardFunction`.
+        info_keys: further entries of the transition, which both functions get as a third argument; see
+            :class:`~torchrl_her.goals.RewardFunction`.
 
     Example:
         >>> rule = EnvReward(lambda a, d: -(a - d).abs(), lambda a, d: a == d)
@@ -152,7 +152,8 @@ def outcomes(reward_fn: RewardFunction | None, achieved_goal: Tensor, *parts: Te
     Args:
         reward_fn: function whose ``info_keys`` name the entries; None for no info.
         achieved_goal: [..., g].
-        *parts: [...], of the same transitions. Each entry is taken from the first part that has it.
+        *parts: tensordicts [...] of the same transitions, such as ``next`` and the root. Each entry is taken
+            from the first part that has it.
 
     Raises:
         KeyError: no part has an entry.
@@ -192,7 +193,7 @@ def ask_reward(reward_fn: RewardFunction, achieved: Outcome, desired_goal: Tenso
     """Calls a reward function for goals [..., g] and checks its (reward, terminated), each [..., 1].
 
     Raises:
-        ValueError: it does not give one finite reward and one bool for each pair of goals.
+        ValueError: the function does not return one finite reward and one bool for each pair of goals.
 
     Example:
         >>> ask_reward(GoalReward(0.1), torch.zeros(2, 1), torch.ones(2, 1))[0].tolist()
@@ -260,9 +261,9 @@ def _checked(reward: Tensor, shape: torch.Size) -> Tensor:
 def missed(
     reward_fn: RewardFunction, achieved: Outcome, desired_goal: Tensor, achieved_reward: float
 ) -> Tensor:
-    """Returns where the reward is below the reward of an achieved goal: [...] of bool, for goals [..., g].
+    """Returns a mask [...] of the pairs of goals [..., g] whose reward is below the given one.
 
-    ``terminated`` is half of the work and not needed, so it is not computed where that can be avoided.
+    ``terminated`` is not needed, so an :class:`EnvReward` computes the reward alone, in half the time.
 
     Args:
         reward_fn: maps (achieved, desired) goals to (reward, terminated).
@@ -281,7 +282,7 @@ def missed(
 
 
 def ends_at_goals(reward_fn: RewardFunction, goals: Outcome) -> bool:
-    """Returns whether an achieved goal ends an episode, for at least one info if infos are read.
+    """Returns whether an achieved goal ends an episode; if info is read, whether it does for some info.
 
     Args:
         reward_fn: maps (achieved, desired) goals to (reward, terminated).

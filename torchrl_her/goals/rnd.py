@@ -27,15 +27,14 @@ _RANGE = 2.0  # standard deviations within which most goals are
 class NetworkNovelty(GoalWeights):
     """Weights goals by the error with which a network predicts the output of a random network.
 
-    The predictor is trained on the goals that are written, so its error is small where there were many like
-    them and large where there were few. Burda et al., Exploration by random network distillation, 2018, with
+    The predictor is trained on the written goals, so its error is small where many goals were written, and
+    large where few were. Burda et al., Exploration by random network distillation, 2018, with
     goals in place of observations; networks and loss are TorchRL's :class:`~torchrl.objectives.RNDLoss`.
-    Goals are normalized by the running mean and standard deviation of those that were written, and clipped
-    at 5.
+    Goals are normalized by the running mean and standard deviation of the written goals, and clipped at 5.
 
-    Before the first goals all weights are 1, and goals that are not finite have weight 0. Networks are made
-    from ``seed`` alone; neither here nor later are random numbers of torch's own generator used. Emptying
-    the buffer (``clear``) starts again with the networks of the beginning.
+    Before the first goals all weights are 1, and goals that are not finite have weight 0. All random numbers
+    come from ``seed``, none from torch's own generator. Emptying the buffer (``clear``) restores the initial
+    networks.
 
     Keyword Args:
         seed: seed of both networks.
@@ -48,7 +47,7 @@ class NetworkNovelty(GoalWeights):
             a part that is spread evenly over them is used.
 
     Raises:
-        ValueError: an option is out of its range, or goals have another width than those before.
+        ValueError: an option is out of its range, or goals have another width than earlier ones.
 
     Example:
         >>> weights = NetworkNovelty(seed=0)
@@ -170,7 +169,7 @@ class _Learned(NamedTuple):
 
 
 def _bounded(goals: Tensor) -> Tensor:
-    """Returns finite goals, normalized and bounded, as inputs of the networks."""
+    """Returns goals in float32, clamped so that sums of their squares cannot overflow."""
     return goals.float().clamp(-_FARTHEST, _FARTHEST)
 
 

@@ -34,10 +34,10 @@ class GoalWeights:
         return goals.new_ones(goals.shape[:-1])
 
     def update(self, goals: Tensor) -> None:
-        """Called with the virtual goals [n, g] that were written or sampled."""
+        """Hook that is called with the virtual goals [n, g] that were written or sampled."""
 
     def clear(self) -> None:
-        """Called when the writer's buffer was emptied."""
+        """Hook that is called when the writer's buffer was emptied."""
 
     def state_dict(self) -> dict[str, Any]:
         """Returns tensors and plain data that :meth:`load_state_dict` takes."""
@@ -92,7 +92,7 @@ class WeightsOfRuns:
 
 
 def weights_by_run(weights: GoalWeights | Sequence[GoalWeights] | None, runs: int) -> list[GoalWeights]:
-    """Returns the weights of R runs as a list; empty if all goals have the same weight.
+    """Returns the weights of R runs as a list; an empty list for None.
 
     Raises:
         ValueError: the number of weights is not R.
@@ -106,7 +106,7 @@ def weights_by_run(weights: GoalWeights | Sequence[GoalWeights] | None, runs: in
 
 
 def checked_weights(weight: Tensor, goals: Tensor) -> Tensor:
-    """Computes weights [...] of goals [..., g] as floating-point numbers, and checks them.
+    """Checks weights [...] of goals [..., g], and returns them as floating-point numbers.
 
     Raises:
         ValueError: the numbers of weights and goals differ, or some weights are negative or not finite.
@@ -129,10 +129,10 @@ def normalized_weights(logs: Tensor, goals: Tensor) -> Tensor:
 
     Args:
         logs: [...], logarithms of the weights; NaN for a goal that must not be drawn.
-        goals: [..., g], which are weighed.
+        goals: [..., g], the goals that the weights belong to.
 
     Returns:
-        [...], 0 where ``logs`` are NaN; of the goals' type, unless that is whole numbers.
+        Weights [...], 0 where ``logs`` are NaN; in the goals' dtype if it is floating-point.
 
     Example:
         >>> normalized_weights(torch.tensor([800.0, 801.0, -1e6, torch.nan]), torch.zeros(4, 2)).tolist()
@@ -146,7 +146,7 @@ def normalized_weights(logs: Tensor, goals: Tensor) -> Tensor:
 
 
 def spread_evenly(count: int, most: int, device: torch.device | None = None) -> Tensor:
-    """Returns the indices of ``count`` items, or of ``most`` of them that are spread evenly.
+    """Returns the indices of ``count`` items, or of ``most`` evenly spread ones if there are more.
 
     The items are divided into equal parts, and one is chosen in each part, at a place that changes from part
     to part. If it were always the first place, and if each part were one episode, all chosen items would be
@@ -159,5 +159,5 @@ def spread_evenly(count: int, most: int, device: torch.device | None = None) -> 
     n = min(count, most)
     part = torch.arange(n, device=device)
     begin, end = part * count // max(n, 1), (part + 1) * count // max(n, 1)
-    share = (part.double() * GOLDEN).frac()  # differs most between neighbors, even over many parts
+    share = (part.double() * GOLDEN).frac()  # place within the part: differs between neighboring parts
     return begin + ((end - begin) * share).long()

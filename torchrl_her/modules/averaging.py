@@ -1,4 +1,4 @@
-"""A policy whose weights are an average of the weights that the learning policy had."""
+"""A policy whose weights are an average over time of the trained policy's weights."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ class PolicyAverage(nn.Module):
 
     At first the decay is ``(1 + n) / (10 + n)`` after n steps, so that the first weights are soon forgotten.
     Buffers, such as running statistics, are copied. Unlike in torch's ``AveragedModel``, one call covers many
-    gradient steps, and takes next to no time, as calls may come every few milliseconds.
+    gradient steps. It takes next to no time, since it may be called every few milliseconds.
 
     Args:
-        policy: the policy that learns.
+        policy: the policy that is trained.
 
     Keyword Args:
         decay: fraction of the average that a gradient step keeps: 0.9995 averages over about 2,000 steps.
@@ -33,7 +33,7 @@ class PolicyAverage(nn.Module):
         steps: [R], gradient steps of each run so far.
 
     Raises:
-        ValueError: the decay is not between 0 and 1, or a parameter is not stacked.
+        ValueError: the decay is not between 0 and 1, or a parameter is not stacked for R runs.
 
     Example:
         >>> from torchrl_her import make_actor
@@ -43,7 +43,7 @@ class PolicyAverage(nn.Module):
         ...     parameter.data += 1.0
         >>> average.follow()
         >>> before, now = next(actor.parameters()) - 1.0, next(average.module.parameters())
-        >>> (now - before).mean().item()  # 1 - 2 / 11, of the way
+        >>> (now - before).mean().item()  # 1 - 2 / 11 of the way to the new weights
         0.8181...
     """
 
@@ -64,7 +64,7 @@ class PolicyAverage(nn.Module):
 
     @property
     def policy(self) -> TensorDictModuleBase:
-        """The policy that learns."""
+        """The policy that is trained."""
         return self._policy[0]
 
     @torch.no_grad()

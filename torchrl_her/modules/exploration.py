@@ -1,4 +1,4 @@
-"""Exploration: a fraction epsilon of the actions, which decays, is not greedy."""
+"""Exploration: replaces a decaying fraction epsilon of the greedy actions by random ones."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def explore(
 def explore_actions(
     greedy: Tensor, actions: int, epsilon: Tensor | float, *, generator: torch.Generator | None = None
 ) -> Tensor:
-    """Epsilon-greedy: with probability epsilon, a uniformly drawn action.
+    """Replaces greedy actions by uniformly drawn ones with probability epsilon.
 
     Args:
         greedy: [...] of integers, the actions of the policy.
@@ -81,7 +81,7 @@ def explore_actions(
 
 
 class Exploration(TensorDictModuleBase):
-    """Replaces a share epsilon of the greedy actions by exploring ones; epsilon decays, for each run apart.
+    """Replaces a share epsilon of greedy actions by exploring ones; each run has its own, decaying epsilon.
 
     Actions stay greedy under ``set_exploration_type(ExplorationType.DETERMINISTIC)`` (or MODE, MEAN).
 
@@ -97,7 +97,7 @@ class Exploration(TensorDictModuleBase):
         epsilon: [R], the present share of exploring actions of each run.
 
     Raises:
-        ValueError: not ``0 <= end <= start <= 1``, or a decay outside of (0, 1].
+        ValueError: ``0 <= end <= start <= 1`` does not hold, or the decay is outside of (0, 1].
     """
 
     def __init__(
@@ -120,11 +120,11 @@ class Exploration(TensorDictModuleBase):
         self.register_buffer("epsilon", torch.full((len(self.generators),), start, dtype=torch.float64))
 
     def step(self) -> None:
-        """Lets epsilon decay; to be called at the end of each epoch."""
+        """Multiplies epsilon by ``decay``; to be called at the end of each epoch."""
         self.epsilon.mul_(self.decay).clamp_(min=self.end)
 
     def restart(self, start: float | None = None, *, run: int | None = None) -> None:
-        """Sets epsilon of one run or of all runs back to where it started, or to another value.
+        """Sets epsilon of one run, or of all runs, to ``start`` or back to its initial value.
 
         Raises:
             ValueError: ``start`` is outside of [0, 1].
@@ -138,7 +138,7 @@ class Exploration(TensorDictModuleBase):
         """Replaces greedy actions by exploring ones, unless exploration is switched off.
 
         Raises:
-            ValueError: the batch cannot be cut into R equal blocks, or the actions are of another kind.
+            ValueError: the batch cannot be cut into R equal blocks, or discrete actions are not integers.
         """
         if exploration_type() not in (ExplorationType.RANDOM, None):
             return tensordict
@@ -214,7 +214,7 @@ class DecayingEpsilonGreedy(Exploration):
         **options: options of :class:`~torchrl_her.modules.Exploration`.
 
     Raises:
-        ValueError: fewer than one action.
+        ValueError: ``actions`` is below 1.
 
     Example:
         >>> from tensordict import TensorDict

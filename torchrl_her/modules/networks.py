@@ -1,4 +1,4 @@
-"""Actor and critic: multilayer perceptrons; the critic takes the action in after its first layer.
+"""Actor and critic: multilayer perceptrons; the action enters the critic after its first layer.
 
 A network holds the weights of one run, or of R independent runs ("stacked"): every weight then has a
 leading dimension R, and one batched product serves all runs. Inputs [..., width] are R equal blocks, one for
@@ -23,8 +23,8 @@ ActivationName = Literal["relu", "tanh", "elu"]
 Norm = Literal["none", "layer", "batch"]
 
 ACTIVATIONS: dict[str, Callable[[], nn.Module]] = {"relu": nn.ReLU, "tanh": nn.Tanh, "elu": nn.ELU}
-_LAST_LAYER = 3e-3  # small last layers keep early actions off the ends of tanh: Lillicrap et al., 2016
-_LEAST_DEPTH = 2  # the critic takes the action in after its first hidden layer, and something must follow
+_LAST_LAYER = 3e-3  # bound of weights that keeps first actions off the ends of tanh: Lillicrap et al., 2016
+_LEAST_DEPTH = 2  # the action enters the critic after its first hidden layer, so another must follow
 
 
 class StackedLinear(nn.Module):
@@ -57,7 +57,7 @@ class StackedBatchNorm(nn.Module):
 
     In the critic's loss, where its weights learn, a batch is normalized by its own statistics, and updates
     the running statistics. Target networks, the actor's loss and evaluation mode use the running statistics
-    and do not change them. By a batch's own statistics, normalization would remove the mean of the values,
+    and do not change them. In the actor's loss, a batch's own statistics would remove the mean of the values,
     which the actor has to raise.
 
     Args:
@@ -121,7 +121,7 @@ class StackedLayerNorm(nn.Module):
 
 @dataclass(frozen=True, kw_only=True)
 class NetworkShape:
-    """Hidden layers of a network.
+    """Width, number, activation and normalization of a network's hidden layers.
 
     Args:
         hidden: width of each hidden layer.
@@ -171,7 +171,7 @@ class GoalNet(nn.Module):
     Args:
         inputs: width of all inputs together.
         actions: width of the action, or number of discrete actions.
-        shape: its hidden layers.
+        shape: shape of the hidden layers.
         runs: R, how many independent networks.
 
     Raises:
@@ -217,7 +217,7 @@ class CriticNet(nn.Module):
     Args:
         inputs: width of all inputs together, without the action.
         actions: width of the action, the last input.
-        shape: its hidden layers.
+        shape: shape of the hidden layers.
         runs: R, how many independent critics.
         outputs: number of outputs.
 
@@ -313,7 +313,7 @@ def make_actor(
     Args:
         widths: widths of the inputs, one for each of ``in_keys``.
         actions: width of the action, which is within [-1, 1].
-        shape: its hidden layers.
+        shape: shape of the hidden layers.
         runs: R, how many independent actors.
         in_keys: keys of the inputs; the goal must be among them.
         action_key: key under which the action is written.
@@ -345,7 +345,7 @@ def make_critic(
     Args:
         widths: widths of the inputs, one for each of ``in_keys``.
         actions: width of the action.
-        shape: its hidden layers.
+        shape: shape of the hidden layers.
         runs: R, how many independent critics.
         outputs: number of outputs, for example quantiles of the return.
         in_keys: keys of the inputs besides the action; the goal must be among them.

@@ -1,4 +1,4 @@
-"""Random numbers of actors and losses: each of several runs has its own."""
+"""Random numbers of actors and losses, from a separate generator for each of several runs."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class RunNoise:
     def subsets(self, count: int, of: int) -> Tensor:
         """Draws distinct whole numbers below ``of`` for each run, [R, count] in ascending order.
 
-        From torch's own generator, all runs share one draw: [1, count].
+        Without generators, all runs share one draw from torch's own, [1, count].
 
         Example:
             >>> RunNoise([torch.Generator().manual_seed(run) for run in range(3)]).subsets(2, 5).shape

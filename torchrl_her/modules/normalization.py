@@ -1,6 +1,6 @@
 """Running normalization: gives each input of networks about mean 0 and standard deviation 1.
 
-The statistics are of all transitions that were written, virtual ones included. Andrychowicz et al.,
+The statistics are computed over all written transitions, virtual ones included. Andrychowicz et al.,
 Hindsight experience replay, 2017, appendix A.
 """
 
@@ -26,8 +26,8 @@ class Moments(NamedTuple):
 
     Attributes:
         n: number of values; not a whole number if values have weights.
-        mean: their mean.
-        var: the mean squared deviation from it.
+        mean: mean of the values.
+        var: mean squared deviation of the values from the mean.
     """
 
     n: Tensor
@@ -176,7 +176,7 @@ class RunningNorm(nn.Module):
 
         Keyword Args:
             key: the entry; None for all.
-            places: positions of numbers in the entry; None for all.
+            places: positions of coordinates in the entry; None for all.
         """
         columns = torch.arange(self.n.shape[-1], device=self.n.device)
         columns = columns if key is None else columns[self.columns_of(key)]
@@ -192,7 +192,7 @@ class RunningNorm(nn.Module):
 
         Args:
             rows: transitions of any shape; with ``runs`` they are run after run, otherwise R equal blocks.
-            runs: indices of the runs that they belong to; None for all R runs.
+            runs: indices of the runs that the rows belong to; None for all R runs.
             counts: number of rows of each of these runs; None if all have the same.
 
         Returns:
@@ -250,12 +250,11 @@ class RunningNorm(nn.Module):
             values: [..., width]; narrower values are the first coordinates of the entry.
 
         Keyword Args:
-            run: index of the run that they belong to.
+            run: index of the run that the values belong to.
             weight: how often each value counts.
 
         Raises:
-            ValueError: the values are wider, or are not finite, which would spoil the statistics for good;
-                or the weight is negative or not finite.
+            ValueError: the values are wider than the entry or not finite; the weight is negative or infinite.
         """
         width, running = values.shape[-1], self.moments_of(key, run)
         if width > len(running.mean):
@@ -275,8 +274,7 @@ class RunningNorm(nn.Module):
             values: [..., width], R equal blocks in the order of the runs.
 
         Returns:
-            [..., width], of the type of the values; of torch's default type if they are whole numbers or
-            flags.
+            Normalized values [..., width] in the same dtype; in torch's default dtype for integers and flags.
 
         Raises:
             ValueError: the values have another width, or cannot be divided among the runs.

@@ -17,9 +17,9 @@ class NormalizeBatch(Transform):
     """Normalizes the transitions that a replay buffer samples: add it with ``buffer.append_transform``.
 
     Relabeling comes before: a :class:`~torchrl_her.HERWriter` stores transitions with their virtual goals,
-    and a :class:`~torchrl_her.HERSampleUnit` puts them in before all transforms. So losses see normalized
-    virtual goals, in the root and under ``next``. What is stored stays raw: read it from
-    ``buffer.storage[...]``, as ``buffer[...]`` goes through this transform, too.
+    and a :class:`~torchrl_her.HERSampleUnit` inserts virtual goals before all transforms. So losses see
+    normalized virtual goals, in the root and under ``next``. Stored transitions stay raw: read them from
+    ``buffer.storage[...]``, since ``buffer[...]`` applies this transform, too.
 
     TorchRL's own transforms do not fit. ``VecNormV2`` works in environments only, before relabeling: goals
     that were normalized at different times cannot be compared, and virtual goals are not counted. The
@@ -36,9 +36,9 @@ class NormalizeBatch(Transform):
         keys: keys of the goals, for ``counted_k``.
 
     Raises:
-        ValueError: ``counted_k`` is negative or not finite, or the desired goal is not normalized; or, when
-            writing, what is to be counted is not finite or has another width.
-        KeyError: when writing, an entry that is to be counted is missing.
+        ValueError: ``counted_k`` is negative or infinite, or the desired goal is not normalized; when
+            writing, an entry to be counted is not finite or has another width.
+        KeyError: when writing, an entry to be counted is missing.
 
     Example:
         >>> import torch
@@ -93,7 +93,7 @@ class NormalizeBatch(Transform):
 
 
 class NormalizedPolicy(TensorDictModuleBase):
-    """Gives a policy normalized inputs, and leaves the entries that others read unchanged.
+    """Runs a policy on normalized inputs, and leaves the observations and goals in the tensordict unchanged.
 
     Only the actor's outputs are put into the tensordict, so collectors yield raw observations and goals, as
     buffers must store them. Exploration belongs behind this module, or within the actor. The statistics are
@@ -101,8 +101,8 @@ class NormalizedPolicy(TensorDictModuleBase):
     with the weights.
 
     Args:
-        actor: trained on batches of :class:`~torchrl_her.modules.NormalizeBatch`. Losses take the actor
-            itself.
+        actor: policy that reads normalized entries. Losses take the actor and not this module, since they get
+            batches from :class:`~torchrl_her.modules.NormalizeBatch`.
         norm: running statistics, which other modules may share.
 
     Raises:

@@ -45,7 +45,7 @@ class BestAction(nn.Module):
         return self.net(*inputs).argmax(-1)
 
     def regret(self, action: Tensor, *inputs: Tensor) -> Tensor:
-        """Returns by how much the value of an action [...] is below the greatest one, [...].
+        """Returns how far the values of actions [...] are below the greatest values of their rows.
 
         Example:
             >>> import torch
@@ -89,8 +89,7 @@ def make_q_actor(
         value_key: key under which the value of a given action is written.
 
     Returns:
-        ``(actor, critic)``, which share their weights; the critic gives the value of the action that it is
-        given.
+        ``(actor, critic)``, which share their weights; the critic computes the value of a given action.
 
     Example:
         >>> import torch

@@ -113,11 +113,11 @@ def make_stochastic_actor(
     in_keys: Sequence[NestedKey] = ("observation", "desired_goal"),
     generators: Sequence[torch.Generator] | None = None,
 ) -> ProbabilisticActor:
-    """Makes SAC's actor: it draws from a squashed normal distribution, whose squashed location is greedy.
+    """Makes SAC's actor: a squashed normal distribution, whose squashed location is the greedy action.
 
     Args:
         widths: widths of the inputs, one for each of ``in_keys``.
-        action_spec: least and greatest actions, of one environment.
+        action_spec: spec of one environment's action, with its bounds.
         shape: its hidden layers.
         runs: R, how many independent actors.
         in_keys: keys of the inputs; the goal must be among them.

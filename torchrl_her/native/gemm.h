@@ -1,11 +1,11 @@
-// Products of small matrices, row by row in memory, for whatever vectors the processor has.
+// Products of small matrices, row by row in memory, with the widest vectors of the processor.
 //
 // A tile of the result stays in registers while the sum over k runs; the rows of B are read in whole vectors. So B
-// and C have rows that are padded to whole vectors (`padded`), and A may have any strides: with the strides of its
-// transpose swapped, the same code multiplies by a transpose.
+// and C have rows that are padded to whole vectors (`padded`). A may have any strides: with its two strides swapped,
+// the same code multiplies by the transpose of A.
 //
-// The numbers of A and B are reals, or pairs of numbers in bfloat16 that stand next to each other along k: then a
-// product of two pairs adds two products, and sums are float32 as before.
+// A and B hold reals, or pairs of bfloat16 numbers that are neighbors along k. A product of two pairs adds two
+// products to a sum, which is float32.
 #pragma once
 
 #include <cstdint>
@@ -63,7 +63,7 @@ struct VectorOf<Pair> {
     using Type = Pairs;
 };
 
-// What is multiplied, and what is added to each row of the result before the activation.
+// One product C = A B, with a bias that is added to each row of C before the activation.
 template <class Number>
 struct Product {
     const Number* a;
@@ -72,19 +72,19 @@ struct Product {
     long b_row;
     real* c;
     long c_row;
-    int k;  // of reals, or of pairs
+    int k;  // length of the sum, in reals or in pairs
     const real* bias;  // padded, or null
     bool relu;
 };
 
-// Clang unrolls these loops only if it is told to, and then keeps sums in registers as g++ does by itself.
+// Clang unrolls these loops only on request, and then keeps sums in registers, as g++ does without a request.
 #if defined(__clang__)
 #define UNROLLED _Pragma("clang loop unroll(full)")
 #else
 #define UNROLLED
 #endif
 
-// M rows and P vectors of columns of the result.
+// Computes a tile of the result: M rows, and P vectors of columns.
 template <int M, int P, class Number>
 inline __attribute__((always_inline)) void tile(const Product<Number>& p, long row, long column) {
     const Number* a = p.a + row * p.a_row;
@@ -109,7 +109,7 @@ inline __attribute__((always_inline)) void tile(const Product<Number>& p, long r
     }
 }
 
-// All rows from `row` on, in tiles of M rows and then of fewer.
+// Computes the rows from `row` to `end` in tiles of M rows, and the rest in smaller tiles.
 template <int M, int P, class Number>
 void rows_of(const Product<Number>& p, int row, int end, long column) {
     for (; row + M <= end; row += M) tile<M, P>(p, row, column);
@@ -117,7 +117,7 @@ void rows_of(const Product<Number>& p, int row, int end, long column) {
         if (row < end) rows_of<(M > 6 ? 6 : M / 2), P>(p, row, end, column);
 }
 
-// C [rows, columns] = A B + bias, with as many columns as whole vectors hold.
+// Computes C [rows, columns] = A B + bias, with columns rounded up to whole vectors.
 template <class Number>
 void multiply(const Product<Number>& p, int rows, int columns) {
     int column = 0;
@@ -128,7 +128,7 @@ void multiply(const Product<Number>& p, int rows, int columns) {
     for (; column < end; column += kLanes) rows_of<12, 1>(p, 0, rows, column);
 }
 
-// The upper half of float32, rounded to the nearest number in bfloat16, and to the even one of two.
+// Returns the bits of a float whose upper half is the nearest number in bfloat16 (ties to even).
 inline Pair rounded(float number) {
     Pair bits;
     __builtin_memcpy(&bits, &number, sizeof(bits));
@@ -140,7 +140,7 @@ inline Pair pair(real first, real second) { return rounded(float(first)) >> 16 |
 
 inline int pairs(int count) { return (count + 1) / 2; }
 
-// Pairs of columns: out [rows, pairs(columns)].
+// Packs neighboring columns into pairs: out [rows, pairs(columns)].
 inline void pair_columns(const real* in, long row, int rows, int columns, Pair* out) {
     for (int r = 0; r < rows; ++r, in += row, out += pairs(columns)) {
         for (int c = 0; c < columns / 2; ++c) out[c] = pair(in[2 * c], in[2 * c + 1]);
@@ -148,7 +148,7 @@ inline void pair_columns(const real* in, long row, int rows, int columns, Pair* 
     }
 }
 
-// Pairs of rows: out [pairs(rows), padded(columns)].
+// Packs neighboring rows into pairs: out [pairs(rows), padded(columns)].
 inline void pair_rows(const real* in, long row, int rows, int columns, Pair* out) {
     for (int r = 0; r < rows; r += 2, out += padded(columns)) {
         const real *first = in + r * row, *second = first + row;

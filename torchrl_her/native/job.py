@@ -12,7 +12,7 @@ import torch
 
 
 class Algorithm(IntEnum):
-    """The losses that there are steps for."""
+    """Algorithms that have compiled gradient steps."""
 
     DDPG = 0
     TD3 = 1
@@ -44,7 +44,7 @@ class Norm(IntEnum):
 class Layer(ctypes.Structure):
     """Layer of a network: its widths, and how many inputs join the network here (in a critic, the action).
 
-    A layer of no inputs normalizes the network's input.
+    A layer with 0 inputs normalizes the network's input.
     """
 
     _fields_ = [(name, ctypes.c_int) for name in ("inputs", "outputs", "joined", "activation", "norm")]
@@ -52,7 +52,7 @@ class Layer(ctypes.Structure):
 
 @dataclass(frozen=True)
 class Structures:
-    """The structures for one type of numbers."""
+    """The ctypes structures for one floating-point type."""
 
     dtype: torch.dtype
     real: Any
@@ -64,7 +64,7 @@ class Structures:
 
 @lru_cache
 def structures(dtype: torch.dtype) -> Structures:
-    """Returns the structures for float32 or float64.
+    """Returns the ctypes structures of ``steps.cpp`` for float32 or float64.
 
     Example:
         >>> structures(torch.float64).real.__name__

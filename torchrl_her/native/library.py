@@ -1,6 +1,6 @@
-"""Compiling C++ for this machine, once, and loading it; or loading the library in a wheel.
+"""Compiles C++ once for this machine and loads it, or loads the compiled library of a wheel.
 
-The build of a wheel runs this file where torch is not installed (``hatch_build.py``).
+The build of a wheel (``hatch_build.py``) runs this file without torch, so it must not import torch.
 """
 
 from __future__ import annotations
@@ -63,8 +63,8 @@ def load_library(source: str, *, headers: Sequence[str] = (), real: str = "float
 
     It is compiled for this processor the first time, which takes some seconds, and kept in the user's cache:
     the folder that ``TORCHRL_HER_CACHE`` names, or ``torchrl_her`` in ``XDG_CACHE_HOME``. The
-    compiler is ``CXX`` from the environment, or else g++, clang++ or c++. Without a compiler, the wheel's
-    library for such processors is loaded, or else the package ``ziglang`` compiles.
+    compiler is ``CXX`` from the environment, or else g++, clang++ or c++. Without a compiler, the library
+    in the wheel is loaded; if the wheel has none for this processor, the package ``ziglang`` compiles.
 
     Args:
         source: the file's name.
@@ -72,8 +72,7 @@ def load_library(source: str, *, headers: Sequence[str] = (), real: str = "float
         real: type that ``REAL`` stands for in the source.
 
     Raises:
-        CannotCompile: there is no compiler, or it failed, or the library cannot be loaded; the message says
-            which. Nor can a wheel's library be loaded.
+        CannotCompile: none of the three ways works; the message says why the compiler failed.
     """
     errors: list[Exception] = []
     for load in (
@@ -136,13 +135,13 @@ def _load_shipped(source: str, real: str) -> ctypes.CDLL:
     for level in levels(platform.machine(), _processor_flags().split()):
         with contextlib.suppress(OSError):  # no wheel of this kind, or the system's libraries are older
             return ctypes.CDLL(str(_SHIPPED / level / shipped_name(source, real)))
-    raise CannotCompile(f"no library of a wheel does the work of {source}")
+    raise CannotCompile(f"no wheel has a library of {source} for this processor")
 
 
 def _load_compiled(compiler: Sequence[str], source: str, headers: Sequence[str], real: str) -> ctypes.CDLL:
     folder = Path(__file__).parent
     text = "".join((folder / name).read_text(encoding="utf-8") for name in (source, *headers))
-    # The processor is part of the name: machines that need other instructions may share a cache.
+    # The processor is part of the name: machines with other instruction sets may share a cache.
     processor = (platform.machine(), platform.processor(), _processor_flags())
     made_of = (text, real, *compiler, _version(compiler), str(_FLAGS), str(_EXTRAS), *processor)
     name = hashlib.sha256("\n".join(made_of).encode()).hexdigest()[:20]
@@ -154,7 +153,7 @@ def _load_compiled(compiler: Sequence[str], source: str, headers: Sequence[str],
 
 
 def _compile(compiler: Sequence[str], source: Path, real: str, library: Path) -> ctypes.CDLL:
-    """Compiles with the first options whose library also loads, and loads it."""
+    """Tries the sets of options in order; returns the first library that compiles and loads."""
     library.parent.mkdir(parents=True, exist_ok=True)
     errors: list[Exception] = []
     with tempfile.TemporaryDirectory(dir=library.parent) as folder:
@@ -186,7 +185,7 @@ def find_compiler() -> list[str]:
 
 
 def find_ziglang() -> list[str]:
-    """Returns the compiler of the package ``ziglang``, which takes a minute the first time.
+    """Returns the command of the compiler in the package ``ziglang``, whose first run takes a minute.
 
     Raises:
         CannotCompile: it is not installed, or ``CXX`` asks for another one.

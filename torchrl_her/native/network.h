@@ -11,7 +11,7 @@
 
 namespace her {
 
-// Memory that a gradient step works in: taken piece by piece, and all given back at its end.
+// Scratch memory of a gradient step: taken piece by piece, and released as a whole by `clear`.
 class Arena {
   public:
     real* take(long count) {
@@ -51,14 +51,14 @@ inline Matrix matrix(Arena& arena, int rows, int columns) {
 enum Activation { kNone, kRelu, kTanh, kElu };
 enum Norm { kPlain, kLayerNorm, kBatchNorm };
 
-// As Python describes a layer. `joined`: how many of the inputs come in here, behind the outputs of the layer before.
-// A layer of no inputs has no product: it is the normalization of the network's input.
+// A layer, as Python describes it. `joined` of its inputs enter the network here, behind the outputs of the layer before.
+// A layer with 0 inputs has no product: it normalizes the network's input.
 struct Layer {
     int inputs, outputs, joined, activation, norm;
 };
 
 constexpr real kNormEpsilon = 1e-5, kMomentum = 0.1;  // as in torch
-constexpr int kLeastPaired = 32;     // width of layers between which products may be of numbers in bfloat16
+constexpr int kLeastPaired = 32;     // least width of layers whose products may be in bfloat16
 
 // A parameter [rows, columns] with all that a step changes. Running statistics have no moments, and no gradient.
 struct Parameter {
@@ -67,15 +67,15 @@ struct Parameter {
     Matrix gradient;
 };
 
-// What a forward pass leaves for the backward pass.
+// Results of a forward pass that the backward pass needs.
 struct Pass {
-    bool learns;                     // whether parameters get gradients; if so, batches have their own statistics
+    bool learns;                     // whether parameters get gradients; if so, batches are normalized by their own statistics
     std::vector<Matrix> values;      // the input, and each layer's output
     std::vector<Matrix> normalized;  // before scale and shift
     std::vector<real*> spread;       // 1 / standard deviation of each row, or of each column of a batch
 };
 
-// The sum of term(0), ..., term(n - 1), lane by lane, so that it is one of vectors.
+// Returns the sum of term(0), ..., term(n - 1), lane by lane, so that it is computed in vectors.
 template <class Term>
 inline real sum_of(int n, Term term) {
     real lanes[kLanes] = {}, sum = 0;
@@ -93,11 +93,11 @@ class Network {
     Network(const Layer* layers, int count, bool bfloat16)
         : layers_(layers, layers + count), bfloat16_(bfloat16 && sizeof(real) == sizeof(float)) {}
 
-    // Of each layer: weight, bias; if normalized, scale, shift; of batches, running mean and variance.
+    // For each layer: weight, bias; if normalized, scale, shift; if by batches, also running mean and variance.
     std::vector<Parameter> parameters;
     bool uses_targets = false;
 
-    // Begins a step: forgets what was made of older weights.
+    // Begins a step: forgets the copies of older weights.
     void begin(Arena& arena) {
         arena_ = &arena;
         weights_.assign(layers_.size(), nullptr);
@@ -107,7 +107,7 @@ class Network {
         biases_.assign(layers_.size(), nullptr);
     }
 
-    // A pass of an input [rows, inputs], which several networks may share.
+    // Prepares a pass for an input [rows, inputs], which several networks may share.
     Pass pass(Matrix input, bool learns = false) {
         const int rows = input.rows;
         Pass pass{learns, {input}, {}, {}};
@@ -122,8 +122,8 @@ class Network {
         return pass;
     }
 
-    // Where a joined input goes: behind the outputs of the layer before, or of the input.
-    // Returns the output; `joined` [rows, width] with a stride may be null where nothing joins.
+    // Computes the network's output. `joined` [rows, width], with a stride, goes behind the outputs of the layer
+    // before, or behind the network's input; it is null if nothing joins.
     Matrix forward(Pass& pass, const real* joined = nullptr, long joined_row = 0) {
         const int rows = pass.values[0].rows;
         for (size_t i = 0; i < layers_.size(); ++i) {
@@ -151,8 +151,8 @@ class Network {
         return pass.values.back();
     }
 
-    // Gradients of all parameters (if the pass learns), from the gradient in the output, which is overwritten.
-    // `joined_slope` [rows, padded], if not null, gets the gradient in the joined input.
+    // Computes the gradients of all parameters (if the pass learns) from the output's gradient, which is overwritten.
+    // `joined_slope` [rows, padded], if not null, gets the gradient of the joined input.
     void backward(const Pass& pass, Matrix slope, Matrix* joined_slope = nullptr) {
         for (int i = int(layers_.size()) - 1; i >= 0; --i) {
             const Layer& layer = layers_[i];
@@ -166,7 +166,7 @@ class Network {
                                        padded(layer.joined), joined_slope->data, joined_slope->row, layer.outputs,
                                        nullptr, false},
                          slope.rows, layer.joined);
-            const bool done = i == 0 || (layer.joined && !pass.learns);  // nothing before the joint is asked for
+            const bool done = i == 0 || (layer.joined && !pass.learns);  // no gradient before the joint is needed
             if (done) return;
             Matrix before = matrix(*arena_, slope.rows, unjoined);
             if (paired(i))
@@ -247,16 +247,16 @@ class Network {
         return weight_pairs_[layer];
     }
 
-    // out [columns, padded(rows)] of in [rows, columns].
+    // Transposes in [rows, columns] to out [columns, padded(rows)].
     template <class Number>
     static void transpose(const Number* in, int rows, int columns, Number* out) {
         const long row = padded(rows);
-        constexpr int kBlock = 16;  // the lines of a block of both stay in the fastest memory
+        constexpr int kBlock = 16;  // a block of both matrices stays in the fastest cache
         for (int r0 = 0; r0 < rows; r0 += kBlock)
             for (int c = 0; c < columns; ++c)
                 for (int r = r0; r < std::min(r0 + kBlock, rows); ++r) out[c * row + r] = in[long(r) * columns + c];
     }
-    // The transpose [outputs, padded] of some rows of a weight.
+    // Returns the transpose [outputs, padded] of some rows of a weight.
     real* transposed(int layer, int first, int count) {
         const Parameter& p = parameter(layer, kWeight);
         real* out = arena_->take(long(p.columns) * padded(count));
@@ -294,7 +294,7 @@ class Network {
         }
     }
 
-    // By the statistics of the batch where the pass learns, which move the running ones; by these elsewhere.
+    // Normalizes by the batch's statistics if the pass learns, and moves the running ones; otherwise by the running ones.
     void normalize_batch(int layer, Pass& pass) {
         const int n = layers_[layer].outputs;
         const Matrix out = pass.values[layer + 1], in = layers_[layer].inputs ? out : pass.values[layer];
@@ -373,7 +373,7 @@ class Network {
         }
     }
 
-    // Through the activation, by its output alone.
+    // Multiplies a gradient by the slope of the activation, which its output determines.
     static void activation_slope(const Layer& layer, Matrix out, Matrix slope) {
         for (int r = 0; r < out.rows; ++r) {
             const real* y = out[r];
@@ -410,12 +410,12 @@ class Network {
 };
 
 // The numbers of Adam for one step: the step's size and the divisor of the second moment's root, bias-corrected; the
-// second beta; what is left of 1 beside each beta, which would lose digits if it were computed here; epsilon.
+// second beta; 1 minus each beta, which would lose digits if it were computed here; epsilon.
 struct Adam {
     real size, spread, beta2, rest1, rest2, epsilon;
 };
 
-// One step of Adam in place, with clipped gradients if there are any, and the soft update of the targets behind it.
+// Makes one step of Adam in place, with clipped gradients, if there are moments; then the soft update of the target.
 inline void adam_step(Parameter& p, const Adam& adam, real clip, real tau) {
     for (int r = 0; r < p.rows; ++r) {
         const long begin = long(r) * p.columns;

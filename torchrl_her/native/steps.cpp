@@ -28,9 +28,9 @@ struct Entry {
 struct Job {
     int algorithm, runs, critics, batch, first_step, steps, rows, actions, threads;
     int actor_layers, critic_layers, actor_tensors, critic_tensors, bfloat16;
-    int target_critics;  // how many critics are drawn for targets, and the actor follows the mean of all; 0: all
+    int target_critics;  // number of critics drawn for targets; the actor then follows the mean of all. 0: all
     int dropped;         // how many of the greatest quantiles of all critics TQC's targets leave out
-    int counts;          // of Adam's steps: one for each run, or one for all
+    int counts;          // number of Adam's step counts: one for each run, or one for all
     const Layer *actor, *critic;
     const Tensors* tensors;  // of the actor, of each critic, and SAC's logarithm of the temperature
     int entries;
@@ -39,10 +39,10 @@ struct Job {
     const int64_t* choice;  // [runs, rows], of discrete actions
     const real* reward;     // [runs, rows]
     const uint8_t* terminated;
-    const real* weight;    // of importance sampling, or null
-    const real* discount;  // of each row's next value, or null
-    const real* noise;       // [steps, runs, batch, actions], standard normal: of the next action
-    const real* own_noise;   // and of the present one
+    const real* weight;    // importance weights, or null
+    const real* discount;  // for the next value of each row; null for gamma
+    const real* noise;       // [steps, runs, batch, actions], standard normal, for the next action
+    const real* own_noise;   // the same for the present action
     const real *low, *high;  // [actions]
     const uint8_t* idle;     // [runs]
     const int32_t* drawn;    // [steps, runs, target_critics], critics
@@ -62,7 +62,7 @@ const real kLeastScale = -10, kGreatestScale = 2;  // of SAC, as in modules/stoc
 // Whether the actor draws actions from a distribution, with a temperature.
 bool is_stochastic(const Job& job) { return job.algorithm == kSac || job.algorithm == kTqc; }
 
-// Of one run.
+// Gradient steps of one run.
 class Learner {
   public:
     Learner(const Job& job, int run, Arena& arena) : job_(job), run_(run), arena_(arena) {
@@ -106,7 +106,7 @@ class Learner {
     std::vector<Network> networks_, targets_;  // the actor (or the values of actions), then the critics
     Parameter temperature_{};
     int step_ = 0;
-    long first_ = 0;  // row
+    long first_ = 0;  // first row of the step's batch
     real* weights_ = nullptr;
     Matrix seen_{}, next_seen_{};  // the networks' inputs
 
@@ -119,14 +119,14 @@ class Learner {
 
     real& loss(int which) { return job_.losses[(long(which) * job_.steps + step_ - job_.first_step) * job_.runs + run_]; }
 
-    // Importance weights with a mean of 1.
+    // Scales the importance weights to a mean of 1.
     void mean_weights() {
         double sum = 0;
         for (int b = 0; b < job_.batch; ++b) sum += weights_[b] = job_.weight ? job_.weight[first_ + b] : 1;
         for (int b = 0; b < job_.batch; ++b) weights_[b] *= real(job_.batch / sum);
     }
 
-    // The entries that networks see, side by side.
+    // Returns the networks' input: its entries side by side.
     Matrix joined(const Entry* entries) {
         int columns = 0;
         for (int e = 0; e < job_.entries; ++e) columns += entries[e].width;
@@ -142,7 +142,7 @@ class Learner {
         return out;
     }
 
-    // The clamped target of a row, from the next state's value.
+    // Returns the clamped target of a row, from the next state's value.
     real target(int b, real next) const {
         const long row = first_ + b;
         const real discount = job_.discount ? job_.discount[row] : job_.gamma;
@@ -154,7 +154,7 @@ class Learner {
         for (int b = 0; b < job_.batch; ++b) values[b] = target(b, values[b]);
     }
 
-    // An action drawn from SAC's policy: what its gradient needs.
+    // An action drawn from SAC's policy, with the numbers that its gradient needs.
     struct Draw {
         Matrix action, tanh, scale;
         real* log_likelihood;
@@ -193,7 +193,7 @@ class Learner {
         return target.forward(pass, action.data, action.row);
     }
 
-    // The least value of the target critics at the next action: of all, or of those that were drawn.
+    // Returns the least value of the next action by the target critics: by all, or by the drawn ones.
     real* least_value(Matrix action) {
         const int some = job_.target_critics, count = some ? some : job_.critics;
         const int32_t* drawn = job_.drawn + (long(step_ - job_.first_step) * job_.runs + run_) * some;
@@ -205,7 +205,7 @@ class Learner {
         return least;
     }
 
-    // The next action, and what is to be added to its value.
+    // The next action, and the entropy term of its value.
     struct Next {
         Matrix action;
         real* entropy;  // or null
@@ -231,7 +231,7 @@ class Learner {
         return {action, nullptr};
     }
 
-    // The gradients of the critics and of the actor.
+    // Computes the gradients of the critics and of the actor.
     void learn_values_and_actions() {
         job_.algorithm == kTqc ? learn_quantiles() : learn_values();
         is_stochastic(job_) ? learn_stochastic_actions() : learn_actions();
@@ -378,7 +378,7 @@ class Learner {
         for (int b = 0; b < batch; ++b) std::fill_n(action_slope[b], actions, real(0));
         const real temperature = std::exp(*temperature_.value);
         double actor_loss = 0, temperature_slope = 0;
-        const bool follows_mean = job_.target_critics || job_.algorithm == kTqc;  // of all outputs, or the least
+        const bool follows_mean = job_.target_critics || job_.algorithm == kTqc;  // of all outputs; otherwise the least
         for (int n = 0; n < job_.critics; ++n) {
             const int outputs = values[n].columns;
             const real parts = real(job_.critics) * outputs;
@@ -496,5 +496,5 @@ extern "C" void her_steps(const her::Job* job) {
     }
 }
 
-// So that Python can tell that both mean the same structures.
+// Lets Python check that its structures have the same size.
 extern "C" long her_job_size() { return sizeof(her::Job); }

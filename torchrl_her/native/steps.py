@@ -1,4 +1,4 @@
-"""Gradient steps in C++."""
+"""Loads the gradient steps in C++."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _TYPES = {torch.float32: "float", torch.float64: "double"}
 
 @lru_cache
 def load_steps(dtype: torch.dtype) -> Any:
-    """Returns the function that makes gradient steps with numbers of a type; it takes a job's address.
+    """Returns the C++ function that makes gradient steps in float32 or float64, given the address of a job.
 
     Args:
         dtype: float32 or float64.

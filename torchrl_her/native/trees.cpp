@@ -1,7 +1,7 @@
-// Trees of sums for several runs: the same as SumTrees in Python computes, number for number.
+// Trees of sums for several runs, with the same results as SumTrees in Python, bit for bit.
 //
 // A level holds `widths[level]` numbers for each run, the leaves first; a node's 16 children follow each other in
-// the level below. What waits for memory is prefetched for a group of draws before any of them goes on.
+// the level below. Memory is prefetched for a whole group of draws, so that draws seldom wait for it.
 
 #include <algorithm>
 #include <cstdint>
@@ -12,7 +12,7 @@ namespace {
 constexpr int FAN = 16;
 constexpr int GROUP = 32;  // draws or nodes whose memory is fetched ahead
 
-// The next smaller number, of one that is at least 0; of 0 it is 0.
+// Returns the next smaller number; 0 stays 0. The number must be at least 0.
 inline float below(float x) {
     uint32_t bits;
     std::memcpy(&bits, &x, sizeof bits);
@@ -29,7 +29,7 @@ inline double below(double x) {
     return x;
 }
 
-// The last of the running sums over the children of a node.
+// Returns the sum of a node's children, added in order.
 float total(const float* children) {
     double sum = 0.0;
     for (int i = 0; i < FAN; ++i) sum += children[i];
@@ -40,7 +40,7 @@ float total(const float* children) {
 
 extern "C" {
 
-// Draws `draws` leaves of each run, where its masses lie: from 0 to the sum of its leaves.
+// Finds the leaf of each run at each of its masses, which are from 0 to the sum of its leaves.
 // Masses, leaf and value are [runs, draws].
 void her_trees_draw(const float* const* levels, const int64_t* widths, int height, int64_t runs, int64_t draws,
                     const double* masses, int64_t* leaf, float* value) {
@@ -100,7 +100,7 @@ void her_trees_draw(const float* const* levels, const int64_t* widths, int heigh
     }
 }
 
-// Sets leaves: `node` [number] are their places among the leaves of all runs. It is overwritten.
+// Sets leaves. `node` [number], their places among the leaves of all runs, is overwritten.
 void her_trees_set(float* const* levels, const int64_t* widths, int height, int64_t runs, int64_t number,
                    int64_t* node, const float* value) {
     for (int64_t i = 0; i < number; ++i) {
@@ -111,7 +111,7 @@ void her_trees_set(float* const* levels, const int64_t* widths, int height, int6
         const float* children = levels[level - 1];
         float* table = levels[level];
         const int64_t all = runs * widths[level];
-        if (number >= all) {  // then all sums are computed just as fast
+        if (number >= all) {  // computing all sums is then just as fast
             for (int64_t i = 0; i < all; ++i) table[i] = total(children + i * FAN);
             continue;
         }

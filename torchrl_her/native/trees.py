@@ -1,4 +1,4 @@
-"""Drawing from trees of sums, and updating them, in C++."""
+"""Loads the C++ functions that draw from trees of sums and update them."""
 
 from __future__ import annotations
 

@@ -19,8 +19,8 @@ def action_cost(action: Tensor, *, l2: float = 0.0, saturation: float = 0.0) -> 
 
     An actor that ends in tanh gets no gradient where its actions are at their bounds. The action L2 penalty
     of OpenAI's HER prevents that by pulling all actions towards 0, but then an actor whose critic cannot tell
-    actions apart yet learns to stand still. The saturation penalty acts on ``atanh(action)`` beyond 2 alone,
-    where its slope is not flattened by tanh, and leaves all other actions free.
+    actions apart yet learns to stand still. The saturation penalty acts only where ``|atanh(action)|`` is
+    above 2, with a slope that tanh does not flatten, and leaves all other actions free.
 
     Args:
         action: [..., a], from -1 to 1.
@@ -28,7 +28,7 @@ def action_cost(action: Tensor, *, l2: float = 0.0, saturation: float = 0.0) -> 
         saturation: weight of the mean of ``max(|atanh(action)| - 2, 0) ** 2``.
 
     Returns:
-        [...].
+        Costs [...].
 
     Example:
         >>> import torch
@@ -66,7 +66,7 @@ class ActorTerms:
             value: the actor's loss: the mean over all rows, or one number for each row.
             loss: TorchRL loss that has the actor.
             action: [..., a], the actor's actions, from -1 to 1.
-            transitions: rows [...].
+            transitions: [...], the transitions of the batch.
         """
         cost = action_cost(action, l2=self.action_penalty, saturation=self.saturation_penalty)
         value = value + (cost if value.ndim else cost.mean())

@@ -21,8 +21,8 @@ class Cloning:
 
     Args:
         weight: weight of the cloning loss, which is added to the actor's, at least 0.
-        q_filter: whether only those actions are cloned that the critic prefers to the policy's.
-        key: key of the flag [..., 1] of bool that marks rows of demonstrations.
+        q_filter: whether to clone only actions that the critic prefers to the policy's.
+        key: key of the bool flag [..., 1] that marks rows of demonstrations.
 
     Raises:
         ValueError: the weight is negative.
@@ -51,13 +51,13 @@ def cloning_terms(
     Args:
         action: [..., B, a], actions of the policy.
         demonstrated: [..., B, a], actions of the demonstrations.
-        flagged: [..., B] of bool, which rows are demonstrations.
+        flagged: [..., B], mask of the rows that are demonstrations.
 
     Keyword Args:
-        better: [..., B] of bool, whether the critic prefers the demonstrated action; None for no Q filter.
+        better: [..., B], mask of the rows whose demonstrated action the critic prefers; None for no Q filter.
 
     Returns:
-        [..., B]
+        Terms [..., B].
 
     Example:
         >>> policy, shown = torch.zeros(4, 1), torch.tensor([[1.0], [2.0], [3.0], [9.0]])
@@ -73,7 +73,7 @@ def cloning_terms(
 
 
 def with_cloning(value: Tensor, loss: Any, cloning: Cloning, transitions: TensorDictBase) -> Tensor:
-    """Adds the cloning loss to an actor's loss, which is one number or one for each row of blocks [..., B].
+    """Adds the cloning loss to an actor's loss, which is a scalar or one number for each row [..., B].
 
     For stochastic policies the cloned action is the greedy one.
     """

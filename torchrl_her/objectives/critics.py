@@ -1,4 +1,4 @@
-"""The critics of a loss: how several are given to it, and the values that they compute."""
+"""Functions that pass critics to a loss of TorchRL, and that compute the values of its critics."""
 
 from __future__ import annotations
 
@@ -20,18 +20,17 @@ from torchrl_her.modules.noise import RunNoise
 def critic_value(loss: LossModule, transitions: TensorDictBase) -> Tensor | None:
     """Returns the value of actions, from the critics of a loss.
 
-    TD3 and SAC train several critics, made anew from the one they are given. The value is the least of
-    theirs, as in the targets. If targets use some critics drawn at random, the value is the mean of all
-    critics, and in TQC the mean of all quantiles, since the actors follow these means. In DQN it is the value
-    of the best action.
+    TD3 and SAC train several critics. The value is the least of their values, as in the targets. If targets
+    use some critics drawn at random, the value is the mean of all critics, and in TQC the mean of all
+    quantiles, since the actors follow these means. In DQN it is the value of the best action.
 
     Args:
         loss: loss of TorchRL, for example from :func:`~torchrl_her.objectives.make_td3_loss`.
-        transitions: [...], with all that the critics read; for all but DQN that includes the action. They are
-            normalized if the loss is trained on normalized ones (:class:`~torchrl_her.modules.RunningNorm`).
+        transitions: [...], with all entries that the critics read: for all losses but DQN also the action. If
+            the loss is trained on normalized transitions, pass such ones.
 
     Returns:
-        [..., 1]; None if the loss has no critics of actions that are known here.
+        Values [..., 1]; None if it is not known how to call the critics of this loss.
 
     Example:
         >>> from tensordict import TensorDict
@@ -57,11 +56,11 @@ def critic_values(loss: LossModule, transitions: TensorDictBase) -> Tensor | Non
 
     Args:
         loss: loss of TorchRL.
-        transitions: [...], with all that the critics read.
+        transitions: [...], with all entries that the critics read.
 
     Returns:
-        [..., E] of E critics, in TQC the mean of the quantiles of each; None if the loss has no critics of
-        actions that are known here.
+        Values [..., E] by E critics, in TQC the mean of each critic's quantiles; None if it is not known
+        how to call the critics of this loss.
     """
     keys: Any = loss.tensor_keys
     has_actions = hasattr(keys, "state_action_value")
@@ -93,7 +92,7 @@ def least_of_some(values: Tensor, count: int, noise: RunNoise) -> Tensor:
     """Returns the least value of all critics, or of some that are drawn at random for each run.
 
     Args:
-        values: [N, ...]; each critic's values are one equal block for each run.
+        values: [N, ...], values by N critics; those of a critic are one equal block for each run.
         count: number of critics that are drawn; 0 for all of them.
         noise: draws the critics, if ``count`` is not 0.
     """
@@ -117,11 +116,11 @@ def checked_subset(target_critics: int, critics: int) -> int:
 def as_critics(
     critic: TensorDictModule | Sequence[TensorDictModule],
 ) -> tuple[TensorDictModule | list[TensorDictModule], int]:
-    """Returns one critic, from which TorchRL makes two, or a list of all critics, and their number.
+    """Returns critics as TorchRL's losses take them, one or a list, and the number that the loss trains.
 
-    TorchRL registers the weights of a list of one critic as buffers, which are not trained. So a single
-    critic is passed by itself; TorchRL then draws new weights, and :func:`connect_critics` puts the old ones
-    back.
+    From one critic, TorchRL makes two. From a list of one critic it would make buffers, which are not
+    trained. The critic of such a list is therefore passed by itself; TorchRL then draws new weights, and
+    :func:`connect_critics` puts the old ones back.
 
     Raises:
         ValueError: the list is empty, or a critic has batch normalization, whose statistics a stack of
@@ -137,16 +136,16 @@ def as_critics(
 
 
 def connect_critics(loss: LossModule, critic: TensorDictModule | Sequence[TensorDictModule]) -> None:
-    """Sets the key of a loss's values, and gives an only critic that came in a list its weights.
+    """Sets the key of a loss's values, and restores the weights of a critic from a list of one.
 
     Args:
-        loss: made with what :func:`as_critics` gave.
+        loss: loss that was made with the result of :func:`as_critics`.
         critic: critic or list of critics that the loss was made with.
     """
     loss.set_keys(state_action_value=loss.qvalue_network.out_keys[0])
     if isinstance(critic, TensorDictModule) or len(critic) > 1:
         return
     weights = TensorDict.from_module(critic[0]).data.unsqueeze(0)
-    for name, params in loss.named_children():  # TorchRL warns of asking for targets before they are updated
+    for name, params in loss.named_children():  # by name: TorchRL warns if targets are read before an update
         if name in ("qvalue_network_params", "target_qvalue_network_params"):
             params.data.update_(weights)

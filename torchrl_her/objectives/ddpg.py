@@ -16,12 +16,12 @@ from torchrl_her.objectives.targets import Targets
 
 
 class PenalizedDDPGLoss(DDPGLoss):
-    """TorchRL's DDPG loss with more terms in the loss of its actor.
+    """TorchRL's DDPG loss with further terms in its actor's loss.
 
     Args:
         *args: arguments of :class:`torchrl.objectives.DDPGLoss`.
         **kwargs: keyword arguments of the same class.
-        terms: the further terms of the actor's loss.
+        terms: terms that are added to the actor's loss.
     """
 
     def __init__(self, *args: Any, terms: ActorTerms = ActorTerms(), **kwargs: Any) -> None:
@@ -36,7 +36,7 @@ class PenalizedDDPGLoss(DDPGLoss):
 
 @contextmanager
 def actions_of(actor: TensorDictModule) -> Iterator[list[Tensor]]:
-    """Collects the actions [..., a], its first output, of each call of an actor in the ``with`` block."""
+    """Collects the actions [..., a] that each call of an actor returns within the ``with`` block."""
     actions: list[Tensor] = []
 
     def note(_module: nn.Module, _inputs: Any, output: TensorDictBase) -> None:
@@ -62,7 +62,7 @@ def make_ddpg_loss(
     Args:
         actor: from :func:`~torchrl_her.make_actor`.
         critic: from :func:`~torchrl_her.make_critic`.
-        targets: discount, and the rewards whose returns targets are clamped to.
+        targets: discount, and the range of rewards; targets are clamped to the returns it allows.
         terms: further terms of the actor's loss.
         reduction: ``"none"`` gives one loss for each transition [R, B], as stacked networks need it.
 

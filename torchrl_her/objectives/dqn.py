@@ -20,7 +20,7 @@ def make_dqn_loss(
 
     Args:
         actor: from :func:`~torchrl_her.modules.make_q_actor`.
-        targets: discount, and the rewards whose returns targets are clamped to.
+        targets: discount, and the range of rewards; targets are clamped to the returns it allows.
         reduction: ``"none"`` gives one loss for each transition [R, B], as stacked networks need it.
 
     Example:

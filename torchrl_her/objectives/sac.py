@@ -1,4 +1,4 @@
-"""SAC from TorchRL's loss, with more terms in the loss of its actor."""
+"""SAC from TorchRL's loss, with further terms in its actor's loss."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from torchrl_her.objectives.targets import Targets
 
 
 class PenalizedSACLoss(SACLoss):
-    """TorchRL's SAC loss (its second version) with more terms in the loss of its actor, for several runs.
+    """TorchRL's SAC loss (its second version) with further terms in its actor's loss, for several runs.
 
     Each of R runs has its own temperature and its own random numbers.
 
@@ -34,7 +34,7 @@ class PenalizedSACLoss(SACLoss):
     Args:
         *args: arguments of :class:`torchrl.objectives.SACLoss`.
         **kwargs: keyword arguments of the same class.
-        terms: the further terms of the actor's loss; penalties are on drawn actions.
+        terms: terms that are added to the actor's loss; penalties act on drawn actions.
         target_critics: number of critics that are drawn for targets; 0 for all.
         noise: source of the loss's random numbers.
 
@@ -132,16 +132,16 @@ def make_sac_loss(
     Haarnoja et al., Soft actor-critic algorithms and applications, 2018.
 
     Args:
-        actor: from :func:`~torchrl_her.modules.make_stochastic_actor`, with its generators. Each run that its
-            networks are stacked for has a temperature of its own.
-        critic: one from :func:`~torchrl_her.make_critic`; TorchRL makes a second like it. Or a list of all.
-            Targets and policy use the least of the critics' values.
+        actor: from :func:`~torchrl_her.modules.make_stochastic_actor`, with its generators. Each run of
+            stacked networks has its own temperature.
+        critic: a critic from :func:`~torchrl_her.make_critic`, to which TorchRL adds a second of the same
+            shape, or a list of all critics. Targets and policy use the least of the critics' values.
         target_critics: number of critics drawn at random in each gradient step: targets use the least of
-            their values, while the policy has the mean of all critics. With 0, both have the least of all
-            critics. Chen et al., Randomized ensembled double Q-learning, 2021.
-        targets: discount, and the rewards whose returns targets are clamped to.
-        temperature: first value of the temperature. At TorchRL's 1, entropy outweighs rewards of -1 and 0 for
-            so long that some runs never find what is rewarded.
+            their values, while the policy maximizes the mean of all critics. With 0, both use the least value
+            of all critics. Chen et al., Randomized ensembled double Q-learning, 2021.
+        targets: discount, and the range of rewards; targets are clamped to the returns it allows.
+        temperature: initial temperature. With TorchRL's default of 1, entropy outweighs rewards of -1 and 0
+            for so long that some runs never achieve a goal.
         terms: further terms of the actor's loss, without a saturation penalty.
         reduction: ``"none"`` gives one loss for each transition [R, B], as stacked networks need it.
 

@@ -1,4 +1,4 @@
-"""Clamped targets, and how target networks follow the online ones."""
+"""Clamped targets, and updates of target networks."""
 
 from __future__ import annotations
 
@@ -73,12 +73,12 @@ class Targets:
         """Makes the targets for ``loss.make_value_estimator`` of any loss of TorchRL.
 
         Args:
-            value_network: gives the value of the next state; None if the loss passes it.
-            value_key: key of that value.
+            value_network: module that computes the next state's value; None if the loss passes the value.
+            value_key: key of the value.
         """
         least, greatest = self.reward_range or (-math.inf, math.inf)
         estimator = ClampedTD0(
-            low=min(least, least / (1.0 - self.gamma)),  # one reward, or one in every step forever
+            low=min(least, least / (1.0 - self.gamma)),  # one step, or steps forever
             high=max(greatest, greatest / (1.0 - self.gamma)),
             gamma=self.gamma,
             value_network=value_network,
@@ -125,7 +125,7 @@ class RunsHardUpdate(HardUpdate, _BuffersToo):
     """Copies the online weights of each of R runs to its target networks, every n steps of the run.
 
     Args:
-        loss: with stacked networks.
+        loss: loss with stacked networks.
 
     Keyword Args:
         interval: gradient steps between two copies.

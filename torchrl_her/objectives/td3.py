@@ -20,7 +20,7 @@ from torchrl_her.objectives.targets import Targets
 
 
 class PenalizedTD3Loss(TD3Loss):
-    """TorchRL's TD3 loss with more terms in the loss of its actor, and separate random numbers for each run.
+    """TorchRL's TD3 loss with further terms in its actor's loss, and separate random numbers for each run.
 
     Targets have the least value of all critics, or of some that are drawn at random in each gradient step, as
     in REDQ (Chen et al., 2021). In the second case the actor follows the mean of all critics instead of the
@@ -29,7 +29,7 @@ class PenalizedTD3Loss(TD3Loss):
     Args:
         *args: arguments of :class:`torchrl.objectives.TD3Loss`.
         **kwargs: keyword arguments of the same class, without ``policy_noise`` and ``noise_clip``.
-        terms: the further terms of the actor's loss.
+        terms: terms that are added to the actor's loss.
         target_critics: number of critics that are drawn for targets; 0 for all.
         target_noise: standard deviation of the noise on the target's actions.
         target_noise_clip: bound of that noise.
@@ -123,12 +123,12 @@ def make_td3_loss(
 
     Args:
         actor: from :func:`~torchrl_her.make_actor`.
-        critic: one from :func:`~torchrl_her.make_critic`; TorchRL makes a second like it. Or a list of all.
-            Targets use the least of the critics' values.
-        action_spec: least and greatest actions, of one environment.
-        target_critics: number of critics drawn at random in each gradient step: targets use the least of
-            their values alone; 0 for all. Chen et al., Randomized ensembled double Q-learning, 2021.
-        targets: discount, and the rewards whose returns targets are clamped to.
+        critic: a critic from :func:`~torchrl_her.make_critic`, to which TorchRL adds a second of the same
+            shape, or a list of all critics. Targets use the least of the critics' values.
+        action_spec: spec of one environment's action, with its bounds.
+        target_critics: number of critics drawn at random in each gradient step, whose least value targets
+            use; 0 for all. Chen et al., Randomized ensembled double Q-learning, 2021.
+        targets: discount, and the range of rewards; targets are clamped to the returns it allows.
         terms: further terms of the actor's loss.
         generators: generators of the random numbers of each run; None for torch's own.
         reduction: ``"none"`` gives one loss for each transition [R, B], as stacked networks need it.

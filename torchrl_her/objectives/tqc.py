@@ -1,4 +1,4 @@
-"""TQC from TorchRL's loss, with more terms in the loss of its actor."""
+"""TQC from TorchRL's loss, with further terms in its actor's loss."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from torchrl_her.objectives.targets import Targets
 
 
 class PenalizedTQCLoss(PenalizedSACLoss, TQCLoss):
-    """TorchRL's TQC loss with more terms in the loss of its actor, for one run or several.
+    """TorchRL's TQC loss with further terms in its actor's loss, for one run or several.
 
     Critics give quantiles of the return instead of its mean. Targets are the quantiles of all critics without
     the greatest ones, and each critic learns all targets. The actor follows the mean of all quantiles.
@@ -62,7 +62,7 @@ class PenalizedTQCLoss(PenalizedSACLoss, TQCLoss):
         keys, steps_key = self.tensor_keys, self.value_estimator.tensor_keys.steps_to_next_obs
         entries = [("next", key) for key in (keys.reward, keys.done, keys.terminated)]
         rows = tensordict.select(*entries, steps_key, strict=False)
-        rows = rows.apply(lambda entry: entry.expand_as(value))  # TorchRL's targets want one shape
+        rows = rows.apply(lambda entry: entry.expand_as(value))  # TorchRL's targets need one shape
         return self.value_estimator.value_estimate(rows, next_value=value)
 
 
@@ -83,15 +83,15 @@ def make_tqc_loss(
 
     Args:
         actor: from :func:`~torchrl_her.modules.make_stochastic_actor`, with its generators.
-        critic: from ``make_critic(..., outputs=M)`` with M quantiles, a second one is made like it; or all N
-            critics in a list.
+        critic: a critic with M quantiles from ``make_critic(..., outputs=M)``, to which TorchRL adds a second
+            of the same shape, or a list of all N critics.
         dropped_quantiles: D; targets leave out the D * N greatest of all N * M quantiles.
         targets, temperature, terms, reduction: as in :func:`~torchrl_her.objectives.make_sac_loss`.
 
     Raises:
-        ValueError: ``temperature`` is not positive, the list of critics is empty, critics do not say how many
-            quantiles they have, as those of ``make_critic`` do, or ``dropped_quantiles`` is negative or
-            leaves none.
+        ValueError: ``temperature`` is not positive, the list of critics is empty, a critic's module lacks the
+            attribute ``outputs``, which critics of ``make_critic`` have, or ``dropped_quantiles`` is
+            negative or leaves no quantile.
 
     Example:
         >>> from torchrl.data import Bounded

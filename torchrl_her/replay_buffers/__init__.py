@@ -1,4 +1,4 @@
-"""Hindsight in a replay buffer: as transitions are written, or as they are sampled."""
+"""Hindsight relabeling in replay buffers, as transitions are written or as they are sampled."""
 
 from torchrl_her.replay_buffers.draw import draw_goals
 from torchrl_her.replay_buffers.env_ids import EnvIds

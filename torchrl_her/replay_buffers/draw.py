@@ -1,4 +1,4 @@
-"""Drawing the virtual goals of whole episodes."""
+"""Draws the virtual goals of whole episodes."""
 
 from __future__ import annotations
 
@@ -37,20 +37,20 @@ def draw_goals(
 ) -> tuple[Tensor, Tensor]:
     """Draws k virtual goals for each transition, or each episode, by strategy times weights times filter.
 
-    Goals are of the same episode; for goals of others see :class:`~torchrl_her.HindsightOptions`.
+    Goals come from the same episode; for goals of other episodes see :class:`~torchrl_her.HindsightOptions`.
 
     Args:
         before: [n, g], the goals that were achieved before the actions.
         after: [n, g], the goals that the actions achieved: the candidates.
-        episodes: positions in ``before`` and ``after``.
+        episodes: positions of the episodes' transitions in ``before`` and ``after``.
         k: number of draws.
 
     Keyword Args:
         strategy: a name or a function, see :func:`~torchrl_her.goals.candidate_range`.
         weights: maps goals [..., g] to how useful each is, [...], such as
             :class:`~torchrl_her.GoalWeights`; None for equal weights.
-        keep: the filter. It maps goals achieved before and goals wanted, [..., g] each and broadcast against
-            each other, to bool [...]: which of them may be drawn; None for all.
+        keep: the filter: maps goals achieved before the actions and candidate goals, [..., g] each, which are
+            broadcast, to bool [...]: whether the candidate may be drawn. None keeps all.
         per: whether each transition gets k goals, or each episode, drawn for its first transition.
         generator: source of the random numbers.
 
@@ -92,8 +92,8 @@ def draw_for_runs(
 ) -> tuple[Tensor, Tensor, list[int]]:
     """Draws the virtual goals of episodes of several runs, each run with its own weights and generator.
 
-    Goals are drawn for each source apart, by candidate times weight times filter. The candidates of a source
-    are goals of the same episode, or goals of recent episodes that the run remembers.
+    Goals are drawn for each source separately, by candidate times weight times filter. The candidates of a
+    source are goals of the same episode, or goals of recent episodes that the run remembers.
 
     Args:
         chunk: Episodes of m runs.
@@ -162,8 +162,8 @@ class _Transitions(NamedTuple):
 
     Attributes:
         row: [n] int64, their positions in the batch.
-        episode: [n] int64, ascending: the episode of each.
-        time: [n] int64, its step there.
+        episode: [n] int64, ascending: the episode of each transition.
+        time: [n] int64, the step of each transition in its episode.
     """
 
     row: Tensor
@@ -187,7 +187,7 @@ class _Transitions(NamedTuple):
         """Returns as candidates the goals that the transition's run remembers.
 
         Args:
-            goals: [p, g].
+            goals: [p, g], the goals that all runs remember.
             lines: positions of each run's goals in ``goals``.
             position: [E] int64, the position of each episode's run; None if there is only one.
         """

@@ -24,8 +24,8 @@ class EnvIds(Transform):
     environments are reset before their episodes end. :class:`~torchrl_her.HERWriter` finds the ids by
     itself, and does not store them.
 
-    Ids are random, drawn by each process that resets the environment first; nothing that is learned depends
-    on their values.
+    Ids are random: each process draws them when it first resets the environment. Results do not depend on
+    their values.
 
     Args:
         key: key of the ids, in the root and under ``next``.
@@ -72,4 +72,4 @@ class EnvIds(Transform):
         return out
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**super().__getstate__(), "_ids": None}  # a copy is another environment
+        return {**super().__getstate__(), "_ids": None}  # a copy is for other environments

@@ -19,8 +19,8 @@ class EpisodeIndex:
     and then time, and a *place*: in the order of places, all rows of an episode follow each other.
 
     Attributes:
-        slots: T, the length of the ring, as far as it is filled.
-        streams: N, rows in each slot; the row of a stream in a slot is ``slot * N + stream``.
+        slots: T, the number of filled slots of the ring.
+        streams: N, the number of rows in each slot; the row of a stream in a slot is ``slot * N + stream``.
         oldest: slot of the oldest rows.
         begins: [R] int64, positions at which runs begin, ascending.
         places: [R] int64, the places of the rows at ``begins``.
@@ -51,7 +51,7 @@ class EpisodeIndex:
         return (position % self.slots + self.oldest) % self.slots * self.streams + position // self.slots
 
     def episode(self, place: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns where the episodes of places [...] begin, and the places behind their newest rows."""
+        """Returns the first place of the episode of each place [...], and the place behind its newest row."""
         episode = torch.searchsorted(self.first, place, right=True) - 1
         return self.first[episode], self.first[episode + 1]
 
@@ -86,9 +86,9 @@ def index_episodes(
         done: [T, N] of bool, time first, N environments; or flat, [T].
         trajectory: ids of the trajectories, integers of the same shape.
         oldest: slot of the oldest row: 0 until the ring is full, then the slot that is overwritten next.
-        seams: pairs of entries, [n, g] each in the order of rows: one from after a row's action, and the one
-            from before the action that must equal it in the episode's next row. An episode ends where they
-            differ: where a second collector uses an id again, or another environment's rows follow.
+        seams: pairs of entries [n, g] of the rows, from after and from before the action: within an episode,
+            the first entry of a row equals the second entry of the next row. An episode ends where these
+            differ, as a second collector uses the same id, or another environment's rows follow.
 
     Returns:
         The index. An episode that was partly overwritten consists of the rows that are left.
@@ -132,6 +132,6 @@ def index_episodes(
 
 
 def _differ(one: Tensor, other: Tensor) -> Tensor:
-    """Returns where vectors [..., g] differ, [...], by coordinate, as torch is slow over few of them."""
+    """Returns a mask [...] of vectors [..., g] that differ, coordinate by coordinate, which saves time."""
     pairs = zip(one.unbind(-1), other.unbind(-1), strict=True)
     return reduce(torch.logical_or, [a != b for a, b in pairs])

@@ -1,4 +1,4 @@
-"""Finding whole episodes among the transitions of many environments."""
+"""Finds whole episodes among the transitions of many environments."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class Episodes:
 
     Attributes:
         rows: [E, T] int64; an episode shorter than T is padded with its last row.
-        lengths: [E] int64.
+        lengths: [E] int64, the lengths of the episodes.
     """
 
     rows: Tensor
@@ -37,7 +37,7 @@ def time_order(streams: Tensor) -> Tensor:
     """Returns positions [n] that sort rows by stream, and keep the order of the rows of each stream.
 
     Args:
-        streams: [n] int64, the environment or trajectory that each row is of.
+        streams: [n] int64, the environment or trajectory of each row.
     """
     if bool((streams[1:] < streams[:-1]).any()):
         return streams.argsort(stable=True)
@@ -50,7 +50,7 @@ def find_episodes(streams: Tensor, end: Tensor, order: Tensor | None = None) -> 
     """Sorts rows into whole episodes and rows of episodes that are still open.
 
     Args:
-        streams: [n] int64, the environment or trajectory that each row is of. Rows of one stream are in the
+        streams: [n] int64, the environment or trajectory of each row. Rows of one stream are in the
             order of time, one episode after the other.
         end: [n] of bool, the last rows of episodes.
         order: [n], from ``time_order``, if it is known already.
@@ -80,14 +80,14 @@ def find_episodes(streams: Tensor, end: Tensor, order: Tensor | None = None) -> 
 def slice_positions(
     place: Tensor, episode: Tensor, ends: Tensor | None = None, inside: Tensor | None = None
 ) -> Tensor:
-    """Groups the transitions of a batch that was sampled as sequences by slice.
+    """Groups the transitions of a batch of slices (sequences) by slice.
 
     Args:
         place: [B] int64, places in :class:`~torchrl_her.replay_buffers.EpisodeIndex`; the places of a slice
             follow each other.
         episode: [B] int64, a number that differs between episodes.
-        ends: [B, 1] of bool, the last transitions of slices. Without them, slices that happen to follow each
-            other are one.
+        ends: [B, 1], mask of the last transitions of slices. Without it, slices that follow each other by
+            chance count as one.
         inside: [B] of bool, False where a slice was padded with its last transition; None for no padding.
 
     Returns:

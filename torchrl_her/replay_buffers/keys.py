@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl_her.checks import check_finite, entry_of
 from torchrl_her.goals.rewards import Outcome, RewardFunction, ask_reward, outcomes
 
-LEAST_COST = 1e-4  # relative: smaller differences are errors of rounding
+LEAST_COST = 1e-4  # relative to a reward: smaller differences are rounding errors
 
 
 @dataclass(frozen=True)
@@ -22,9 +22,9 @@ class TransitionKeys:
     Attributes:
         achieved, next_achieved: the goal achieved before the action, and the one achieved by it.
         goals: the desired goal, in the root and under ``next``.
-        reward, terminated, truncated, done: under ``next``.
-        trajectory, env_ids: ids.
-        real_goal: the goal that the task itself asked for, where another one was proposed in its place.
+        reward, terminated, truncated, done: keys under ``next``.
+        trajectory, env_ids: ids of trajectories and of environments.
+        real_goal: the task's own goal, where another goal was proposed in its place.
         stage: the stage of a curriculum that an episode is played in.
     """
 
@@ -106,11 +106,11 @@ def failures(
 ) -> tuple[Tensor, Tensor]:
     """Returns where an episode terminated without its goal, as by a fall, and the cost of that.
 
-    Such an end and its cost do not depend on the goal, so virtual goals get both, too.
+    Such an end and its cost do not depend on the goal, so virtual transitions have both, too.
 
     Returns:
-        ``(failed, cost)``, [n, 1] each: bool, and the reward minus the reward function's result, which
-        is below 0, or 0 where nothing failed.
+        ``(failed, cost)``, [n, 1] each: a mask, and the collected reward minus the reward function's, which
+        is negative; 0 where nothing failed.
 
     Example:
         >>> import torch
@@ -151,7 +151,7 @@ def in_root_and_next(keys: Sequence[NestedKey]) -> list[NestedKey]:
     """Returns each key, and the same key under ``next``.
 
     Raises:
-        TypeError: one key in place of several.
+        TypeError: ``keys`` is a single key.
 
     Example:
         >>> in_root_and_next(["state"])
@@ -163,7 +163,7 @@ def in_root_and_next(keys: Sequence[NestedKey]) -> list[NestedKey]:
 
 
 def device_of(transitions: TensorDictBase) -> torch.device:
-    """Returns the device of transitions, from their entries if a collector's batch has none set."""
+    """Returns the device of transitions; of their first entry if the batch itself has no device."""
     if transitions.device is not None:
         return transitions.device
     return next((entry.device for entry in transitions.values(True, True)), torch.device("cpu"))

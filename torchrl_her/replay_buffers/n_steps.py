@@ -1,4 +1,4 @@
-"""Returns over n steps: their windows, and their discounted sums."""
+"""Windows of n steps, and the discounted sums of the rewards in them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class NStepReturn(NamedTuple):
     Attributes:
         reward: [..., 1], the discounted sum.
         last: [...] int64, the position in the window of the last step.
-        terminated: [..., 1] of bool, of the last step.
+        terminated: [..., 1] of bool, whether the last step terminates.
     """
 
     reward: Tensor
@@ -36,8 +36,8 @@ def n_step_return(reward: Tensor, terminated: Tensor, inside: Tensor, gamma: flo
     Reinforcement Learning, 2018, equation 7.1.
 
     Args:
-        reward: [..., n, 1], of each step of the window.
-        terminated: [..., n, 1] of bool.
+        reward: [..., n, 1], the reward of each step of the window.
+        terminated: [..., n, 1] of bool, whether each step terminates.
         inside: [..., n] of bool, which steps belong to the episode: the first ones, at least one.
         gamma: the discount of one step.
 
@@ -58,16 +58,16 @@ def n_step_return(reward: Tensor, terminated: Tensor, inside: Tensor, gamma: flo
 
 
 def windows(start: Tensor, end: Tensor, n_steps: int) -> tuple[Tensor, Tensor]:
-    """Returns the places of n steps that begin at ``start`` and stay in front of ``end``.
+    """Returns the places of up to n steps from ``start`` on, all before ``end``.
 
     Args:
         start: [...] int64.
-        end: [...] int64, one behind the episode's last place; above ``start``.
+        end: [...] int64, the place behind the episode's last one; above ``start``.
         n_steps: n.
 
     Returns:
-        ``(places, inside)``, [..., m] each; m is n, or the longest way to an end, if that is shorter. Places
-        beyond the episode repeat its last one.
+        ``(places, inside)``, [..., m] each; m is n, or the greatest number of steps before an ``end`` if that
+        is smaller. Places beyond the episode repeat its last one.
 
     Example:
         >>> places, inside = windows(torch.tensor([4, 7]), torch.tensor([6, 10]), 100)

@@ -26,7 +26,7 @@ SHARED = (
     "the buffer with what the collector yields"
 )
 
-MASK = ("collector", "mask")  # TorchRL's mark of what is not padding
+MASK = ("collector", "mask")  # TorchRL's mask of the rows that are not padding
 
 
 def samplers_of(storage: Storage) -> Iterator[Sampler]:

@@ -27,7 +27,7 @@ from torchrl_her.goals.weights import GoalWeights
 from torchrl_her.replay_buffers.keys import LEAST_COST, TransitionKeys, in_root_and_next, under_next
 
 Per = Literal["transition", "episode"]
-_SUSPICIOUS = 10  # that many episodes of one step hardly come by chance
+_SUSPICIOUS = 10  # so many episodes of one step hardly occur by chance
 
 
 class _NotGiven(int):
@@ -74,10 +74,10 @@ class HindsightOptions:
         exclude: entries to leave out, in the root and under ``next``. ``state`` is one of them because it
             holds the real goal. Add whatever else was computed from the desired goal.
         keys: keys of the goals, in the root and under ``next``, and of reward and flags under ``next``.
-        trajectory_key: ids that tell trajectories apart; the entry may be missing.
-        env_ids_key: ids that tell environments apart, as :class:`~torchrl_her.EnvIds` gives them; the entry
-            may be missing, and is not stored by the writer.
-        real_goal_key: the task's own goal, if another goal was proposed in its place
+        trajectory_key: key of ids that distinguish trajectories; the entry may be missing.
+        env_ids_key: key of ids that distinguish environments, as :class:`~torchrl_her.EnvIds` makes them; the
+            entry may be missing, and is not stored by the writer.
+        real_goal_key: key of the task's own goal, if another goal was proposed in its place
             (:class:`~torchrl_her.behavior.BehaviorGoals`); the entry may be missing, and is left out like
             entries of ``exclude``. The source ``"actual"`` takes these goals.
         stage_key: key of the stage [..., 1] that an episode was played in, for writers with ``stages``.
@@ -86,7 +86,7 @@ class HindsightOptions:
     Raises:
         ValueError: a number is not whole, not finite or too small, there is no such strategy or source,
             ``goal_sources`` and another ``k`` or ``strategy`` are given, ``n_steps`` is above 1 without
-            ``gamma`` or with whole episodes, ``per`` is neither of the two.
+            ``gamma`` or with whole episodes, or ``per`` is another word.
         TypeError: ``exclude`` is a single key, or ``goal_sources`` no mapping.
 
     Example:
@@ -295,8 +295,8 @@ class HindsightBase:
             one, other = (values[differ[0, 0]].item() for values in (computed, reward))
             warnings.warn(
                 f"the reward function gives {one:g} where the collected reward is {other:g}, and other ones "
-                f"in {len(differ):,} of {len(reward):,} rows; pass the environment's own rule, or virtual "
-                "transitions have rewards by another one (this warning appears once)",
+                f"in {len(differ):,} of {len(reward):,} rows; pass the environment's own rule, since "
+                "virtual transitions get the rewards of this function (this warning appears once)",
                 stacklevel=4,
             )
 

@@ -95,8 +95,8 @@ class HERSampleUnit(HindsightBase, SampleUnit):
     the buffer both the unit and its :meth:`relabel`, as in the example.
 
     Candidates are the transitions of the same episode that are still stored. If an episode's beginning was
-    overwritten, they are the remaining ones; if an episode is still open, those up to the newest one, which
-    is also the goal of ``"final"`` then. Flat transitions of several environments are distinguished by
+    overwritten, they are the remaining ones. In an open episode they reach up to its newest transition, from
+    which ``"final"`` then takes the goal. Flat transitions of several environments are distinguished by
     trajectory ids. Under samplers of slices, all transitions of a slice get the same goal: one that its last
     transition may take and, with the filter, that was not achieved before. A priority belongs to the real
     transition, whatever goal it had when the priority was computed.
@@ -107,7 +107,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
     After each write, sampling the next batch searches the whole storage for the ends of episodes.
 
     Read stored transitions from the storage (``buffer.storage[:]``): the buffer itself raises an error if it
-    is read without sampling. So does a ``ReplayBufferEnsemble``, which samples without its members' units.
+    is read without sampling. A ``ReplayBufferEnsemble`` raises one, too, since it leaves out the unit.
 
     Args:
         reward_fn: maps (achieved, desired) goals to (reward, terminated), for instance
@@ -182,8 +182,8 @@ class HERSampleUnit(HindsightBase, SampleUnit):
         """Chooses virtual goals for a batch, which :meth:`relabel` then writes into it.
 
         Returns:
-            ``(index, info)``, unchanged but for the metadata, if asked for; under a sampler of slices without
-            its entries that are written over a batch afterwards and would hide where it terminates.
+            ``(index, info)``, unchanged, with metadata if there are any. Under a sampler of slices, ``info``
+            lacks the flags that TorchRL would write over the batch, which would hide where it terminates.
         """
         pending = self._chosen.pop(self._key(), None) is not None
         stored = self._read(storage)
@@ -285,7 +285,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
         # No generator, as in TorchRL, since none can be copied to another process; the storage is read again.
         return {**self.__dict__, "generator": None, "_stored": None}
 
-    # The work
+    # Helpers
 
     def _key(self) -> tuple[str, int]:
         return self._token, get_ident()
@@ -362,7 +362,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
         self, stored: _Stored, row: Tensor, virtual: Tensor, goals: Tensor
     ) -> tuple[TensorDictBase, NStepReturn]:
         """Computes ``next`` and returns over n steps of rows [B], some of which have virtual goals."""
-        gamma = self.options.gamma or 1.0  # several steps always have one
+        gamma = self.options.gamma or 1.0  # options with n_steps > 1 have one
         place = stored.episodes.place(row)
         places, inside = windows(place, stored.episodes.episode(place)[1], self.options.n_steps)
         window = stored.episodes.row(places)
@@ -392,7 +392,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
             refuse_consuming("HERSampleUnit", storage)
             refuse_unordered("HERSampleUnit", storage)
             refuse_shared("HERSampleUnit", storage)
-            if storage.ndim > 1:  # in flat ones, the sampler marks copies of rows
+            if storage.ndim > 1:  # in flat storages, the sampler marks copies of rows
                 refuse_slices("HERSampleUnit", storage)
             rows = storage[:]  # a view
             if not is_tensor_collection(rows):
@@ -435,9 +435,9 @@ class HERSampleUnit(HindsightBase, SampleUnit):
     def _draw(
         self, stored: _Stored, group: Tensor, source: Strategy, generator: torch.Generator | None
     ) -> tuple[Tensor, Tensor]:
-        """Draws rows [V] whose goals a source gives to groups, and returns which groups [V] get one.
+        """Draws the row [V] whose goal each group gets, and returns a mask [V] of the groups that get one.
 
-        Groups [V, L] are rows that get the same goal, which is one of their last row: single rows, or slices.
+        A group [L] is a single row or a slice. Its rows get the same goal, a candidate of its last row.
         """
         if len(group) == 0:
             return group[:, 0], group[:, 0].bool()
@@ -493,7 +493,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
         return index.squeeze(-1), valid.squeeze(-1)
 
     def _kept(self, stored: _Stored, group: Tensor, goals: Tensor) -> Tensor:
-        """Applies the filter: returns which of the goals [V, c, g] groups [V, L] may take, [V, c] of bool."""
+        """Applies the filter: returns a mask [V, c] of the goals [V, c, g] that groups [V, L] may take."""
         rule = partial(missed, self.reward_fn, achieved_reward=self.achieved_reward)
         before = self._keys.before(stored.rows, self.reward_fn)
         kept = rule(before[group].unsqueeze(1), goals.unsqueeze(2)).all(-1)

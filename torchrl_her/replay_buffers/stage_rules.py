@@ -30,7 +30,7 @@ class StageRule(NamedTuple):
 def split_stages(
     rows: TensorDictBase, episodes: Episodes, run: Tensor | None, key: NestedKey, stages: Sequence[StageRule]
 ) -> Iterator[tuple[int, TensorDictBase, Episodes, Tensor | None]]:
-    """Yields the transitions as each stage shows them, and its episodes, in the order in which they came.
+    """Yields each stage with an index, the transitions as it shows them, its episodes, and their runs.
 
     Args:
         rows: [n], transitions.

@@ -71,20 +71,20 @@ def broken(
     held: int,
     resumed: bool,
 ) -> Tensor:
-    """Returns where an episode is over although its last transition is not done, [n] of bool.
+    """Returns a mask [n] of transitions that are the last of their episode although they are not done.
 
-    That is where another episode's transition follows in the same stream: an environment was reset from
-    outside, or another collector uses the same ids again.
+    Another episode's transition follows them in the same stream: an environment was reset from outside, or
+    another collector uses the same ids again.
 
     Args:
         rows: [n], the first of which were held back, as their episodes were open.
-        streams: [n], of all rows.
-        order: [n], of :func:`~torchrl_her.replay_buffers.episodes.time_order`.
-        done: [n] of bool, where episodes are known to be over.
+        streams: [n], the stream of each row.
+        order: [n], result of :func:`~torchrl_her.replay_buffers.episodes.time_order`.
+        done: [n], mask of the rows that are known to end an episode.
         keys: keys of the goals.
         kind: property that distinguishes streams.
         held: number of rows that were held back.
-        resumed: whether they come from a checkpoint: their episodes may then end anywhere.
+        resumed: whether these rows come from a checkpoint: their episodes may then end anywhere.
 
     Raises:
         ValueError: streams are places in the batch, and it cannot be known whether an episode is over, or
@@ -111,7 +111,7 @@ def broken(
 
 
 def ends_of_held(streams: Tensor, order: Tensor, held: int) -> Tensor:
-    """Returns which transitions are the last of a stream among those that were held back: [n] of bool."""
+    """Returns a mask [n] of the last held-back transition of each stream."""
     rows = order[order < held]
     last = torch.ones_like(rows, dtype=torch.bool)
     last[:-1] = streams[rows[1:]] != streams[rows[:-1]]
@@ -119,7 +119,7 @@ def ends_of_held(streams: Tensor, order: Tensor, held: int) -> Tensor:
 
 
 def _jumps(rows: TensorDictBase, keys: TransitionKeys, last: Tensor, new: Tensor, where: Tensor) -> Tensor:
-    """Returns which of the given pairs of neighbors [n - 1] are not of one episode, by their goals."""
+    """Returns a mask of the pairs of neighbors ``where`` [n - 1] whose goals show that an episode ends."""
     at = where.nonzero().squeeze(-1)
     jumps = torch.zeros_like(where)
     if len(at) == 0:

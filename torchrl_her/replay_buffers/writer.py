@@ -47,7 +47,7 @@ class _Draft(NamedTuple):
     runs: list[int]
     real: WrittenRows
     virtual: WrittenRows | None
-    numbers: list[WriterCounts]  # of each run
+    numbers: list[WriterCounts]  # counts of each run
     weighted: bool  # whether weights are updated with the virtual goals
     ids: int  # number of trajectory ids that the episodes take
 
@@ -115,7 +115,7 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
             :class:`~torchrl_her.HindsightOptions`.
 
     Raises:
-        ValueError: an option is out of its range, or (when extending) the writer does not fit another part.
+        ValueError: an option is out of its range, or (when extending) another part does not suit the writer.
         TypeError: ``exclude`` is one key, not a list.
         KeyError: a batch lacks an entry (when extending).
         RuntimeError: the buffer was copied to another process.
@@ -286,7 +286,7 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
             warnings.warn(
                 f"{self.held_back:,} transitions of open episodes wait for their end, more than the buffer's "
                 f"{self._storage.max_size:,}: do all episodes end, and do batches of several environments "
-                "come as [N, T]? (this is said once)",
+                "come as [N, T]? (this warning appears once)",
                 stacklevel=2,
             )
         return index.reshape(data.shape)
@@ -391,7 +391,7 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__({**state, "_process": os.getpid()})
 
-    # The work
+    # Helpers
 
     def _check(self, data: TensorDictBase) -> None:
         """Raises an error if this writer cannot write a batch."""

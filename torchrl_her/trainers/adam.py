@@ -14,8 +14,8 @@ from torchrl_her.trainers.runs import run_dims
 class RunsAdam(torch.optim.Adam):
     """Adam for the stacked networks of R independent runs, each of which counts its own steps.
 
-    Its bias corrections depend on how many steps were made. A run that was idle while others learned has
-    made fewer, so with one count for all runs it would not learn as it does alone. Each parameter's
+    Adam's bias corrections depend on the number of steps. A run that was idle while others learned has made
+    fewer steps, so with one count for all runs it would not learn as it does alone. Each parameter's
     ``step`` is therefore a tensor [1, R, 1, ...] that is broadcast against it; a learner leaves the states
     of idle runs as they were (see :func:`~torchrl_her.trainers.keep_runs`).
 

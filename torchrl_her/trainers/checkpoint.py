@@ -39,7 +39,7 @@ from torchrl_her.torchrl_private import (
 _MAGIC = b"torchrl-her checkpoint 1\n"
 _PIECE = 1 << 26  # bytes between two syncs to disk
 _BODY = len(_MAGIC) + hashlib.sha256().digest_size  # start of torch's file
-_REMAINING = "_remaining_batches"  # of a sampler's pass over the data; TorchRL's states lack it
+_REMAINING = "_remaining_batches"  # rest of a sampler's pass over the data, which TorchRL's states lack
 _PLAIN = (bool, int, float, str, type(None), torch.Size, torch.dtype)
 
 
@@ -85,7 +85,7 @@ def save_checkpoint(state: dict[str, Any], path: str | Path, *, keep: int = 1) -
 
     Raises:
         TypeError: something in ``state`` is neither a tensor nor plain data, so it could not be loaded.
-        OSError: the file cannot be written; the one before is untouched.
+        OSError: the file cannot be written; the previous checkpoint is untouched.
     """
     _check_plain(state, "the state")
     path = Path(path)
@@ -138,8 +138,8 @@ def load_checkpoint(path: str | Path, *, map_location: torch.device | str = "cpu
         path: a file that :func:`~torchrl_her.save_checkpoint` wrote.
 
     Keyword Args:
-        map_location: device to load tensors to, whatever device they were on; ``load_state_dict`` brings them
-            to the device of what they are loaded into.
+        map_location: device of the loaded tensors. The ``load_state_dict`` of a module copies them to the
+            device of the module.
 
     Raises:
         CheckpointError: the file is damaged, not a checkpoint, or holds more than tensors and plain data.
@@ -170,8 +170,8 @@ def load_newest_checkpoint(path: str | Path, *, keep: int = 2) -> dict[str, Any]
         keep: as given to :func:`~torchrl_her.save_checkpoint`.
 
     Raises:
-        CheckpointError: all of them are damaged.
-        OSError: there is none, or it cannot be read.
+        CheckpointError: all checkpoints are damaged.
+        OSError: there is no checkpoint, or it cannot be read.
 
     Example:
         >>> import tempfile
@@ -200,8 +200,8 @@ def collector_state_dict(collector: BaseCollector) -> dict[str, Any]:
     """Returns the state of a collector between two batches, without its policy: counters and open episodes.
 
     TorchRL's own state leaves out open episodes, since most environments cannot continue them. If the
-    environment's state is restored too, a run continues exactly. Collectors in several processes do not give
-    their open episodes away: a restored one begins new episodes.
+    environment's state is restored too, a run continues exactly. The open episodes of a collector in
+    several processes cannot be read: after it is restored, it begins new ones.
     """
     state = {name: value for name, value in collector.state_dict().items() if name != "policy_state_dict"}
     carrier = carrier_of(collector)
@@ -265,7 +265,7 @@ def _block(
             "packed": convert(storage.packed[begin:end]),
             "fields": [tuple(field) for field in storage.fields],
         }
-    rows = storage[:] if storage.ndim > 1 else storage[begin:end]  # a buffer would transform them
+    rows = storage[:] if storage.ndim > 1 else storage[begin:end]  # the buffer would transform rows
     return {"entries": rows.apply(convert).to_dict(), "shape": list(rows.batch_size)}
 
 
@@ -275,7 +275,7 @@ def _capacity(buffer: TensorDictReplayBuffer) -> int:
 
 
 def _alone(rows: Tensor) -> Tensor:
-    """Separates rows of a tensor from its memory without copying: torch.save would write all rows."""
+    """Returns rows as a tensor whose storage has no others, without a copy: torch.save writes storages."""
     if not rows.is_contiguous():
         return rows.clone()
     start = rows.storage_offset() * rows.itemsize
@@ -329,7 +329,7 @@ def _load_block(storage: Storage, begin: int, end: int, block: dict[str, Any]) -
 def sampler_state_dict(sampler: Sampler, size: int) -> dict[str, Any]:
     """Returns the state that decides, together with random numbers, which rows a sampler draws next.
 
-    The state of a prioritized sampler has the rows below ``size``, the filled ones of its storage, alone.
+    For a prioritized sampler it holds the priorities of the first ``size`` rows only, which are filled.
     """
     if isinstance(sampler, SamplerEnsemble):
         # Whole trees of the ensemble's members: the number of filled rows of each is not known here.

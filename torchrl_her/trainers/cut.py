@@ -18,8 +18,8 @@ def cut_episodes(batch: TensorDictBase) -> TensorDictBase:
     episodes would otherwise never see their end.
 
     Args:
-        batch: [N, T] with time last; or flat [n], with ``("collector", "traj_ids")``, without which it is one
-            environment's.
+        batch: [N, T] with time last; or flat [n], with ``("collector", "traj_ids")``. Without these ids, all
+            rows are of one environment.
 
     Returns:
         The same transitions; ``truncated`` and ``done`` under ``next`` are set in the last one of each

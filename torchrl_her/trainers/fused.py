@@ -59,9 +59,9 @@ class FusedLearner:
     span several steps (``steps_to_next_obs``, see :class:`~torchrl_her.objectives.ClampedTD0`).
 
     Raises:
-        ValueError: the loss, its targets or the optimizer are set to what the fused steps do not do, see
+        ValueError: the fused steps do not support the loss, its targets or the optimizer, see
             :func:`~torchrl_her.trainers.why_not_fused`: use :class:`~torchrl_her.LossLearner`. Or
-            ``matmul_dtype`` does not fit these weights.
+            ``matmul_dtype`` does not suit these weights.
         CannotCompile: there is no C++ compiler, and no library in a wheel.
 
     Example:
@@ -114,8 +114,8 @@ class FusedLearner:
 
         Raises:
             ValueError: the rows are not of R runs, not a whole number of batches, not on the CPU, carry
-                a mask of TorchRL's losses or do not fit the networks; a batch of one row is to be
-                normalized; or the loss or its optimizer were changed to what this learner cannot do.
+                a mask of TorchRL's losses or do not match the networks; a batch of one row is to be
+                normalized; or the loss or its optimizer has changed to one that is not supported.
         """
         check_rows(rows, steps, self.runs)
         self._check(rows, steps)
@@ -186,7 +186,7 @@ class FusedLearner:
         return (Layer * len(layers))(*layers)
 
     def _check(self, rows: TensorDictBase, steps: int) -> None:
-        """Raises an error if something has changed since the learner was made that it does not support."""
+        """Raises an error if the loss or the optimizer now has settings that fused steps do not support."""
         if rows.numel() == steps * self.runs and any(layer.norm == Norm.BATCHNORM for layer in self._critic):
             raise ValueError("batches must have at least 2 rows for batch normalization, got 1")
         if self.loss.reduction not in ("mean", "none"):

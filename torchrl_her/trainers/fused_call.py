@@ -1,4 +1,4 @@
-"""The arguments of a compiled update: transitions, random numbers and settings as memory."""
+"""Arguments of a compiled update: settings, and addresses of transitions and random numbers."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from torchrl_her.trainers.fusing import FusedLoss
 _FORKED: list[bool] = []
 os.register_at_fork(after_in_child=lambda: _FORKED.append(True))
 
-# random numbers of a step: first of next actions, then of present ones
+# number of noise tensors of a step: the first is for next actions, the second for present ones
 _DRAWS = {Algorithm.TD3: 1, Algorithm.SAC: 2, Algorithm.TQC: 2}
 
 
@@ -30,8 +30,8 @@ class FusedCall:
     """Arguments of one compiled update. Attributes keep the memory alive to which the arguments point.
 
     Args:
-        loss: its options are read anew for each update, since they may be scheduled.
-        fused: names of its networks, and the steps.
+        loss: loss whose options are read anew for each update, since they may be scheduled.
+        fused: algorithm of the loss, and names of its networks.
         kinds: the structures for the type of the weights.
         rows: [R, S * B] transitions of R runs.
         steps: S.
@@ -39,8 +39,8 @@ class FusedCall:
         actor: layers of the actor.
 
     Raises:
-        ValueError: an entry has another width, a discrete action is out of range, or the loss was set to
-            leave out more quantiles than there are.
+        ValueError: an entry has another width, a discrete action is out of range, or the loss drops more
+            quantiles than there are.
     """
 
     def __init__(
@@ -148,7 +148,7 @@ class FusedCall:
             job.action = self._entry(action, self._actions, key)
         job.reward = self._entry(rows.get(("next", "reward")), 1, ("next", "reward"))
         terminated = rows.get(("next", "terminated"), None)
-        if terminated is None:  # as TorchRL's targets are
+        if terminated is None:  # as in TorchRL's targets
             terminated = rows.get(("next", "done"))
         job.terminated = self._entry(terminated, 1, ("next", "terminated"), torch.bool)
         weight = rows.get("priority_weight", None)

@@ -48,7 +48,7 @@ class FusedWeights:
         self.parameters: list[nn.Parameter] = [
             tensor for tensor, _ in (*actor, *critic, *temperature) if isinstance(tensor, nn.Parameter)
         ]
-        # Each tensor of each network: which parameter, its target, and which of how many critics in it.
+        # Each tensor of each network: parameter, target, index of the critic, and number of critics in it.
         self._places = [
             *((tensor, delayed, 0, 1) for tensor, delayed in actor),
             *(
@@ -89,7 +89,7 @@ class FusedWeights:
         return self._table
 
     def _check(self, states: Sequence[State]) -> None:
-        """Raises a ValueError for memory that the steps must not touch."""
+        """Raises a ValueError for tensors that compiled steps cannot work on."""
         for parameter, target, *_ in self._places:
             moments = (self._state(parameter).get(name) for name in _STATE[:2])
             for tensor in (parameter, target, *moments):
@@ -136,7 +136,7 @@ class FusedWeights:
 
 
 def _tensors(loss: LossModule, network: str, *, delayed: bool) -> list[tuple[Tensor, Tensor | None]]:
-    """Yields a network's parameters and running statistics with their targets, layer by layer."""
+    """Returns a network's parameters and running statistics with their targets, layer by layer."""
     names = getattr(loss, network).state_dict()
     online = getattr(loss, f"{network}_params").flatten_keys(".")
     if not delayed:

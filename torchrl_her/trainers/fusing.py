@@ -37,10 +37,10 @@ from torchrl_her.trainers.adam import RunsAdam
 
 @dataclass(frozen=True)
 class FusedLoss:
-    """Names of the networks and options in a kind of loss that can be fused.
+    """Description of a type of loss that can be fused: its networks, and the options that it must have.
 
     Attributes:
-        algorithm: the steps.
+        algorithm: algorithm of the compiled steps.
         actor_net: type of the actor's network.
         losses: the names of the measured losses.
         fixed: attributes of the loss and the values that they must have, besides those of all losses.
@@ -170,7 +170,7 @@ def network_of(module: nn.Module) -> nn.Module:
 
 
 def layers_of(net: nn.Module) -> list[Layer] | None:
-    """Returns the layers of one of this library's networks, from its input on; None if others occur.
+    """Returns the layers of one of this library's networks, from its input on; None if it has others.
 
     The tensors of the layers, in the same order, are those of ``net.state_dict()``: weight and bias, behind
     them scale and shift of a normalization, and the running mean and variance of a batch normalization.

@@ -78,7 +78,7 @@ class GraphLearner(LossLearner):
         self._priority = getattr(loss.tensor_keys, "priority", None)
 
     def update(self, rows: TensorDictBase, steps: int = 1, *, idle: Sequence[int] = ()) -> dict[str, Tensor]:
-        """Gradient steps of each run; see :class:`~torchrl_her.trainers.Learner`.
+        """Makes gradient steps for each run; see :class:`~torchrl_her.trainers.Learner`.
 
         Raises:
             ValueError: the rows are not of R runs or not a whole number of batches.
@@ -195,8 +195,8 @@ def why_not_recorded(loss: LossModule, target: TargetNetUpdater | None = None) -
     """Returns why gradient steps cannot be recorded as a CUDA graph, or None if they can.
 
     Args:
-        loss: any of TorchRL's.
-        target: moves its target networks.
+        loss: any loss of TorchRL.
+        target: update of its target networks.
     """
     if getattr(getattr(loss, "terms", None), "cloning", None) is not None:
         return "behavior cloning of demonstrations, whose places in a batch are read from the GPU"

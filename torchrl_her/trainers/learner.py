@@ -1,4 +1,4 @@
-"""The protocol of learners, and one that applies any TorchRL loss."""
+"""The protocol of learners, and a learner for any TorchRL loss."""
 
 from __future__ import annotations
 
@@ -83,11 +83,11 @@ class LossLearner:
     gives each run the gradient that it would have alone.
 
     Args:
-        loss: the outputs whose names begin with ``loss`` are summed; no two of them may train the same
-            network.
-        optimizer: over the loss module's parameters; must be elementwise, as Adam is, if there are several
-            runs, and a :class:`~torchrl_her.trainers.RunsAdam` if some of them may be idle.
-        target: moves the target networks; None for a loss without them.
+        loss: loss module. Outputs whose names begin with ``loss`` are summed; no two of them may train the
+            same network.
+        optimizer: optimizer of the loss module's parameters; must be elementwise, as Adam is, if there are
+            several runs, and a :class:`~torchrl_her.trainers.RunsAdam` if some runs may be idle.
+        target: update of the target networks; None for a loss without them.
         max_grad_norm: norm to which the gradients are clipped, for each network of each run separately.
         runs: R.
 
@@ -116,7 +116,7 @@ class LossLearner:
 
         Raises:
             ValueError: the rows are not of R runs or not a whole number of batches, or the loss does
-                not give one number for each of them.
+                not give one number for each row.
         """
         check_rows(rows, steps, self.runs)
         last = rows.ndim - 1

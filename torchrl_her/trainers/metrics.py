@@ -19,7 +19,7 @@ def first_episode(done: Tensor) -> Tensor:
         done: [..., T] of bool.
 
     Returns:
-        [..., T] of bool.
+        Mask [..., T] of these steps.
 
     Example:
         >>> first_episode(torch.tensor([False, True, False, True])).tolist()
@@ -37,18 +37,18 @@ def at_the_end(rollout: TensorDictBase, values: Tensor) -> Tensor:
 def success(
     rollout: TensorDictBase, reward_fn: RewardFunction | None = None, *, achieved_reward: float = 0.0
 ) -> Tensor:
-    """Returns whether the goal is achieved at the last step of the episode, the success of Fetch's papers.
+    """Returns whether the goal is achieved at the last step of the episode, as papers on Fetch measure it.
 
     Args:
         rollout: [N, T].
-        reward_fn: tells which goals are achieved, where the rollout has no entry ``("next", "is_success")``;
+        reward_fn: decides which goals are achieved if the rollout lacks the entry ``("next", "is_success")``;
             see :func:`~torchrl_her.goals.is_achieved`.
 
     Keyword Args:
         achieved_reward: the least reward of an achieved goal.
 
     Returns:
-        [N] of bool.
+        Mask [N] of the successful episodes.
 
     Example:
         >>> from tensordict import TensorDict
@@ -75,7 +75,7 @@ def final_distance(rollout: TensorDictBase) -> Tensor:
         rollout: [N, T].
 
     Returns:
-        [N], in the unit of the goals.
+        Distances [N], in the unit of the goals.
     """
     gap = distance(rollout.get(("next", "achieved_goal")), rollout.get(("next", "desired_goal")))
     return at_the_end(rollout, gap)
@@ -90,10 +90,10 @@ def discounted_return(rollout: TensorDictBase, gamma: float, *, tail_reward: flo
     Args:
         rollout: [N, T].
         gamma: discount.
-        tail_reward: reward of every step after a truncation, of all episodes or of each [N].
+        tail_reward: reward of every step after a truncation, one number or one for each episode [N].
 
     Returns:
-        [N]
+        Returns [N] of the episodes.
 
     Raises:
         ValueError: ``gamma`` is outside of [0, 1).

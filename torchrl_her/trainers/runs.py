@@ -1,4 +1,4 @@
-"""Independent runs in stacked networks: clipping the gradients of each, and leaving some unchanged."""
+"""Functions for independent runs in stacked networks: clip each run's gradients, keep some runs unchanged."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def keep_runs(
 
     Args:
         loss: its tensors have a dimension of R equal blocks, in the order of the runs (see ``run_dims``).
-        optimizer: over its parameters.
+        optimizer: optimizer of the loss's parameters.
         kept: the runs that stay unchanged.
         runs: R.
 
@@ -60,7 +60,7 @@ def keep_runs(
 
 
 def _entries(loss: nn.Module, optimizer: torch.optim.Optimizer, runs: int) -> list[tuple[int, Tensor, int]]:
-    """Yields all tensors that are divided among R runs: a key, the tensor, and the dimension of the runs."""
+    """Returns all tensors that are divided among R runs: a key, the tensor, and the dimension of the runs."""
     dims = run_dims(loss)
     entries = [(entry, dims[name]) for name, entry in loss.state_dict().items()]
     dim_of = {id(parameter): dims.get(name, 0) for name, parameter in loss.named_parameters()}
@@ -88,7 +88,7 @@ def clip_by_run(parameters: Sequence[nn.Parameter], max_norm: float, *, runs: in
         dim: the dimension of the runs.
 
     Returns:
-        [R], the norms before clipping.
+        Norms [R] before clipping.
 
     Example:
         >>> weight = nn.Parameter(torch.zeros(2, 1, 1))

@@ -22,7 +22,7 @@ from torchrl_her.replay_buffers.writer import HERWriter
 from torchrl_her.trainers.cut import cut_episodes
 from torchrl_her.trainers.learner import Learner
 
-_IDLE = -torch.inf  # measurement of a run that did not learn; NaN would hide runs that diverged
+_IDLE = -torch.inf  # marks a run that did not learn; NaN would hide runs that diverged
 
 
 class Schedule(Protocol):
@@ -93,11 +93,11 @@ class Trainer:
     Args:
         collector: yields batches [R * E, T] that the exploring policy played. With :class:`CollectsAhead` it
             collects the next batch while this loop learns from the last one.
-        buffer: replay buffer: for one run any, usually with a :class:`~torchrl_her.HERWriter`; for several
-            one whose writer (``HERWriter(..., runs=R)``) and sampler are for R runs. With demonstrations a
+        buffer: replay buffer, usually with a :class:`~torchrl_her.HERWriter`. For several runs, its writer
+            (``HERWriter(..., runs=R)``) and sampler must be for R runs. To learn from demonstrations, pass a
             :class:`~torchrl_her.demonstrations.MixedReplay`.
-        learner: learns from sampled rows.
-        schedules: take a step after each epoch, for example exploration and weights of goals.
+        learner: learner that makes gradient steps on sampled rows.
+        schedules: objects whose ``step`` is called after each epoch, such as exploration and goal weights.
 
     Keyword Args:
         runs: R.
@@ -242,7 +242,7 @@ class Trainer:
         return measured
 
     def _learn_from(self, idle: list[int], steps: int) -> dict[str, Tensor]:
-        """Makes gradient steps; returns measurements, [steps, R] each, with a mark in place of idle runs'."""
+        """Makes gradient steps; returns measurements, [steps, R] each, with a mark for idle runs."""
         drawn = self.buffer.sample(self.runs * self.batch_size * steps)
         rows = drawn.view(self.runs, -1)
         measured = self.learner.update(rows, steps, idle=idle)
@@ -320,13 +320,13 @@ def evaluate(
     """Plays greedy episodes, one in each environment of a batch.
 
     Args:
-        env: batched, [N]; not the one that is trained in, whose episodes it would disturb.
-        policy: its exploration is switched off meanwhile.
-        max_steps: T.
+        env: batch of N environments; not those of the training, whose episodes would be disturbed.
+        policy: policy whose exploration is switched off during the episodes.
+        max_steps: T, number of steps.
 
     Returns:
-        The rollout [N, T]. Environments whose episode ends early go on; metrics such as
-        :func:`~torchrl_her.success` look at the first episode only.
+        The rollout [N, T]. Environments whose episode ends early begin another; metrics such as
+        :func:`~torchrl_her.success` use the first episode only.
     """
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         return env.rollout(max_steps, policy, break_when_any_done=False)

@@ -1,4 +1,4 @@
-"""Transitions of one or several runs with their runs and streams: a batch, or the part that is held back."""
+"""Transitions of a batch, or those held back from earlier batches, with their runs and environments."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ class Batch:
     Attributes:
         rows: [n]; without entries if n = 0.
         kind: property that distinguishes environments.
-        ids: [n] int64, the environment or trajectory that each transition is of.
-        run: [n] int64, the run that each is of; None if there is only one.
+        ids: [n] int64, the environment or trajectory of each transition.
+        run: [n] int64, the run of each transition; None if there is only one.
 
     Example:
         >>> from torchrl_her import HindsightOptions
@@ -85,7 +85,7 @@ class Batch:
         return streams if self.run is None else streams + self.run * (int(streams.max()) + 1)
 
     def take(self, index: Tensor) -> Batch:
-        """Returns copies of some of the transitions, [m]."""
+        """Returns copies of the transitions at the positions ``index`` [m]."""
         rows = take_rows(self.rows, index) if len(index) else _NO_ROWS
         run = None if self.run is None else self.run[index]
         return replace(self, rows=rows, ids=self.ids[index], run=run)
@@ -96,7 +96,7 @@ class Batch:
         return self.take(stays.nonzero().squeeze(-1))
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns tensors and plain data that :meth:`from_state` takes."""
+        """Returns the transitions, their runs and their ids, as tensors and plain data."""
         return {
             "held_runs": torch.empty(0, dtype=torch.int64) if self.run is None else self.run.clone(),
             "held": self.rows.to_dict() if len(self) else None,

@@ -20,7 +20,7 @@ class Piece(NamedTuple):
     """Episodes that are written at once.
 
     Attributes:
-        runs: m numbers of runs that have episodes among these.
+        runs: indices of the m runs that have episodes in this piece.
         episodes: episodes, run after run.
         position: [E] int64, ascending: the position in ``runs`` of each episode's run; None for a single run.
     """
@@ -30,7 +30,7 @@ class Piece(NamedTuple):
     position: Tensor | None = None
 
     def sums(self, number: Tensor) -> list[int]:
-        """Sums numbers [E] of the episodes for each of the m runs."""
+        """Sums numbers [E], one of each episode, for each of the m runs."""
         if self.position is None:
             return [int(number.sum())]
         return number.new_zeros(len(self.runs)).index_add_(0, self.position, number).tolist()
@@ -53,7 +53,7 @@ class Chunk:
     """Episodes that are relabeled and written together.
 
     Attributes:
-        rows: [n], collected transitions; other episodes are among them.
+        rows: [n], collected transitions, with other episodes among them.
         run: [n] int64, the run of each row; None if there is only one.
         piece: Positions of the episodes in ``rows``, by run.
         reward_fn: Maps (achieved, desired) goals to (reward, terminated).
@@ -89,14 +89,14 @@ class Chunk:
 def split_runs(
     episodes: Episodes, run: Tensor | None, settings: Sequence[Hashable], *, each: int, together: int
 ) -> Iterator[Piece]:
-    """Splits episodes into pieces whose tables have a limited number of entries.
+    """Splits episodes into pieces whose tables (episodes times longest length) have a limited size.
 
     How the episodes of a run are split does not depend on the other runs.
 
     Args:
         episodes: episodes, run after run.
         run: [E] int64, ascending: the run of each episode, of R; None if there is only one.
-        settings: R settings, one of each run; only runs with equal settings share a piece.
+        settings: one object for each of R runs; only runs with equal objects share a piece.
 
     Keyword Args:
         each: most entries in the table of a single run's episodes. One episode may have more.

@@ -75,7 +75,7 @@ class RecentGoals:
                 number, goals, row = torch.ones_like(lengths), keys.asked_for(rows), episodes.rows[:, 0]
             else:
                 number, goals, row = lengths, achieved, episodes.rows[episodes.inside]
-            # Of the type of achieved goals, as all virtual goals are.
+            # In the dtype of achieved goals, which all virtual goals have.
             new = stored_as(goals.index_select(0, row), achieved, keys.next_achieved)
             counts = [len(new)]
             if run is not None:
@@ -91,10 +91,10 @@ class RecentGoals:
         )
 
     def lines(self, name: str, runs: Sequence[int]) -> tuple[Tensor, Episodes]:
-        """Joins the remembered goals of one kind of some runs, which all have goals.
+        """Joins the goals of one kind that some runs remember; each of these runs must have goals.
 
         Returns:
-            ``(goals, lines)``: [p, g], and the positions of each run's goals among them, as of an episode.
+            ``(goals, lines)``: goals [p, g], and the positions of each run's goals, one line for each run.
         """
         parts = [goals for run in runs if (goals := self.goals[name][run]) is not None]
         goals = parts[0] if len(parts) == 1 else torch.cat([part.to(parts[-1]) for part in parts])
@@ -102,7 +102,7 @@ class RecentGoals:
         return goals, Episodes.consecutive(lengths.cumsum(0) - lengths, lengths)
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns tensors and plain data that :meth:`from_state` takes."""
+        """Returns the goals of all runs, for each kind."""
         return {name: list(goals) for name, goals in self.goals.items()}
 
     @classmethod
@@ -112,7 +112,7 @@ class RecentGoals:
 
 
 def _last(before: Tensor | None, new: Tensor, size: int) -> Tensor | None:
-    """Returns the last ``size`` of old [m, g] and new goals; of too many new ones, evenly spread ones."""
+    """Returns the last ``size`` of old and new goals [m, g]; if the new ones are more, an even sample."""
     if len(new) == 0:
         return before
     if len(new) > size:

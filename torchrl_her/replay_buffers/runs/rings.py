@@ -1,4 +1,4 @@
-"""Rows for each run to write to: R equal blocks of a storage, each a ring buffer."""
+"""Ring buffers in one storage: each of R runs writes to its own block of rows."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ class Rings:
         runs: R.
 
     Attributes:
-        cursors: R, the places within the blocks where the next rows go.
-        sizes: R, the numbers of rows that the blocks hold.
+        cursors: for each run, the place within its block where the next row goes.
+        sizes: for each run, the number of filled rows in its block.
 
     Example:
         >>> rings = Rings(2)
@@ -72,7 +72,7 @@ class Places:
     """Finds the storage rows that the rows of a batch were written to.
 
     Args:
-        run: [n] int64, the run of each row; None if all are of one.
+        run: [n] int64, the run of each row; None if there is only one.
         n: number of rows.
         runs: R.
         device: device of the result.
@@ -94,10 +94,10 @@ class Places:
         """Records that more rows of some runs were written.
 
         Args:
-            runs: m numbers of runs.
+            runs: indices of m runs.
             last: m tensors [c] int64, for each of these runs the positions in the batch of the rows that were
                 written last, in that order. Rows before them are copies, whose places are not needed.
-            counts: m numbers of all rows that were written, of each of these runs.
+            counts: number of all rows that were written for each of these runs.
         """
         for run, positions, count in zip(runs, last, counts, strict=True):
             self._written[run] += count
@@ -108,8 +108,8 @@ class Places:
         """Returns the storage row [n] of each row of the batch; -1 if it was not written or is overwritten.
 
         Args:
-            cursors: R, of :class:`Rings`, after everything was written.
-            capacity: rows of a block.
+            cursors: cursors of :class:`Rings`, after all rows were written.
+            capacity: number of rows in a block.
         """
         place, run = self._place, self._run
         begins = [cursor - count for cursor, count in zip(cursors, self._written, strict=True)]

@@ -79,8 +79,8 @@ class RunsSampler(_BlockSampler):
     """Draws the same number of transitions of each of R runs, uniformly within each run.
 
     The storage is R equal blocks of rows, as :class:`~torchrl_her.HERWriter` fills them. A batch is R equal
-    blocks, too, in the order of the runs. What a run draws does not depend on the other runs. In place of a
-    run without transitions, rows of the first run that has some are given.
+    blocks, too, in the order of the runs. What a run draws does not depend on the other runs. A run
+    without transitions gets rows of the first run that has some.
 
     Args:
         capacity: rows of each run's block.
@@ -153,8 +153,8 @@ class RunsPrioritizedSampler(_BlockSampler, PrioritizedSampler):
         beta: how far importance weights make up for priorities; 1 for fully.
 
     Keyword Args:
-        eps: added to priorities.
-        reduction: reduction of priorities that come as several numbers for a row.
+        eps: constant that is added to priorities.
+        reduction: how several priorities of one row are reduced to one, such as ``"max"``.
 
     Raises:
         ValueError: there is no run, or not a generator for each of several; alpha or beta is negative; when

@@ -40,9 +40,9 @@ class PackedStorage(LazyTensorStorage):
     Drawing a row then takes one access to memory, and not one for each entry, which makes it many times as
     fast: rows are drawn from all over a storage that is larger than any cache. Entries that are read are
     views of the drawn rows, so their memory is not contiguous. Everything else is as in
-    ``LazyTensorStorage``, also for what cannot be packed: entries that are no tensors, nested tensordicts
-    that are empty or have a batch size of their own, and storages of tensors instead of tensordicts. Entries
-    that only later rows have are packed when they first come, which copies the storage once.
+    ``LazyTensorStorage``. It stores data that cannot be packed as its parent does: entries that are no
+    tensors, nested tensordicts that are empty or have another batch size, and tensors instead of tensordicts.
+    If later rows have new entries, the storage is copied once to pack these, too.
 
     Args:
         max_size: number of rows.

@@ -1,4 +1,4 @@
-"""Sums of the numbers of several runs, kept so that a row can be drawn in proportion to its number."""
+"""Sum trees of several runs, for drawing rows in proportion to their priorities."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ class SumTrees:
         return leaf, leaves.view(-1).index_select(0, node).view(u.shape)
 
     def _native(self) -> Any:
-        """Returns the trees in C++, for ordinary memory; None if they are not available."""
+        """Returns the functions in C++ if the trees are on the CPU; None on a GPU or if they are missing."""
         return load_trees() if self.native and self._levels[0].device.type == "cpu" else None
 
     def _pointers(self) -> tuple[Any, Any, int, int]:
@@ -142,7 +142,7 @@ class SumTrees:
 
 
 def _total(children: Tensor) -> Tensor:
-    """Returns the sums [n] over children [n, 16], by running sums: draws round in the same way."""
+    """Returns the sums [n] over children [n, 16], as running sums, so that they round as draws do."""
     return children.cumsum(-1)[:, -1]
 
 

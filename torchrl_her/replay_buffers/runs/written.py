@@ -1,4 +1,4 @@
-"""Real and virtual transitions that a writer stores: what copies of collected ones change, and the rows."""
+"""Builds the real and virtual transitions that a writer stores, as copies of collected ones with changes."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ class WrittenRows:
     """Real or virtual transitions [m] of some runs: copies of collected ones, except for some entries.
 
     Attributes:
-        root: [m] int64, positions of the collected transitions whose root they have, one run after the other.
-        last: [m] int64, positions of those whose ``next`` they have; the same tensor as ``root`` if
-            transitions are over single steps.
+        root: [m] int64, positions of the collected transitions that the root is copied from, sorted by run.
+        last: [m] int64, positions of the collected transitions that ``next`` is copied from; the same tensor
+            as ``root`` if transitions span single steps.
         changes: Entries that differ, [m, ...] each.
-        reward: [m], of the last step.
+        reward: [m], the reward of the last step.
         counts: Numbers of transitions of each run, which sum to m.
     """
 
@@ -54,14 +54,14 @@ class WrittenRows:
         changes = dict(self.changes)
         for key, value in self.changes.items():
             if (entry := rows.get(key, None)) is not None:
-                # The discounted sum of whole numbers is not a whole number.
+                # Discounted sums of integers are not integers, so their dtype stays.
                 summed = STEPS_KEY in changes and value.is_floating_point()
                 changes[key] = value.view(-1, *entry.shape[1:]) if summed else stored_as(value, entry, key)
         return replace(self, changes=changes)
 
 
 def real_rows(chunk: Chunk, *, first_id: int) -> WrittenRows:
-    """Returns all transitions of a chunk, for their desired goals.
+    """Returns the real transitions of a chunk, with their own desired goals.
 
     If whole episodes are written, those ended by a reset from outside are truncated, so that samplers of
     slices find their end.
@@ -93,14 +93,14 @@ def real_rows(chunk: Chunk, *, first_id: int) -> WrittenRows:
 def virtual_rows(chunk: Chunk, source: Tensor, goals: Tensor, *, first_id: int) -> WrittenRows:
     """Returns copies of a chunk's transitions, each for a virtual goal.
 
-    Over several steps, a transition ends where it terminates: by the reward function, or because the episode
-    did so although its goal was not achieved. The cost of such a failure, besides the goal's reward, is kept.
+    A transition over several steps ends where it terminates: by the reward function, or where the episode
+    itself terminated without its goal. The cost of such a failure is added to the reward.
     Copies of whole episodes end where the reward function terminates them, and are truncated at the episode's
     end otherwise.
 
     Args:
         chunk: Episodes of m runs.
-        source: [V] int64, the transitions that are copied, or the first ones of whole episodes that are.
+        source: [V] int64, the copied transitions; if whole episodes are copied, their first transitions.
         goals: [V, g], the goal of each copy.
         first_id: Trajectory id of the first copy, if whole episodes are written.
     """
@@ -227,7 +227,7 @@ def take_rows(transitions: TensorDictBase, index: Tensor) -> TensorDictBase:
 
 
 def _take(entry: Any, index: Tensor) -> Any:
-    """Copies rows of an entry. Torch indexes single numbers several times faster than rows of one number."""
+    """Copies rows of an entry; rows of one number are flattened, since torch then indexes far faster."""
     if not isinstance(entry, Tensor):
         return entry[index]
     if entry.shape[1:].numel() == 1:
