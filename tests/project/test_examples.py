@@ -32,10 +32,10 @@ def test_the_one_file_moves_from_reaching_to_throwing() -> None:
     path = "recipes/one_file_cher.py"
     assert len((ROOT / path).read_text().splitlines()) <= 250
     cher = script(path)
-    results = list(cher.train(cher.Options(epochs=4, episodes=20)))
-    assert [result.frames for result in results] == [10_240, 20_480, 30_720, 40_960]
+    results = list(cher.train(cher.Options(epochs=2, episodes=20)))
+    assert [result.frames for result in results] == [10_240, 20_480]
     assert (results[0].stage, results[-1].stage) == ("reach", "throw")
-    assert max(result.success for result in results if result.stage == "reach") >= 0.9
+    assert results[0].success >= 0.9
 
 
 def test_the_guide_s_python_runs_from_top_to_bottom() -> None:

@@ -106,8 +106,8 @@ def test_tasks_of_this_package_have_no_failures() -> None:
 
 def rows_after_falls(**options: Any) -> Any:
     """What a buffer has of some random episodes: the rewards of rows that ended by a fall."""
-    components = build(make_recipe(task=TASK, **{**OPTIONS, **options}))
-    for _, batch in zip(range(60), components.collector, strict=False):
+    components = build(make_recipe(task=TASK, **{**OPTIONS, "num_envs": 8, "epoch_frames": 80, **options}))
+    for _, batch in zip(range(15), components.collector, strict=False):
         components.buffer.extend(batch)
     rows = components.buffer[:]
     components.close()

@@ -65,6 +65,14 @@ def write_run(
     (home / "policy.safetensors").touch()
 
 
+def write_study(folder: Path) -> Path:
+    """The study as a user's file."""
+    path = folder / "bias.yaml"
+    about = {"summary": "a <small> one", "recipe": RECIPE, "vary": STUDY.vary, **SAID}
+    path.write_text(yaml.safe_dump(about, sort_keys=False))
+    return path
+
+
 def table(path: Path) -> list[dict[str, str]]:
     with open(path, newline="") as file:
         return list(csv.DictReader(file))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import html
 import re
 import shutil
@@ -14,7 +13,6 @@ import torch
 
 from torchrl_her_envs.common.rendering.video import write_video
 from torchrl_her_recipes.cli import main
-from torchrl_her_recipes.reports import compare
 from torchrl_her_recipes.reports import page as page_module
 
 from ..small import Refused
@@ -24,8 +22,7 @@ from .test_page import Checker, text_of
 
 @pytest.fixture(autouse=True)
 def _quick_pages(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Drawing and intervals take seconds, and are tested with the pages of studies."""
-    monkeypatch.setattr(compare, "bootstrap", functools.partial(compare.bootstrap, repetitions=10))
+    """Drawing takes seconds, and is tested with the pages of studies."""
     monkeypatch.setattr(page_module, "draw_pictures", lambda cells, finals, figures: {})
 
 

@@ -14,21 +14,16 @@ import yaml
 from torchrl_her_recipes.cli import main
 from torchrl_her_recipes.config.study import Study
 from torchrl_her_recipes.reports import tidy
-from torchrl_her_recipes.reports.page import write_report
 from torchrl_her_recipes.reports.results import Combination, read_combinations
 from torchrl_her_recipes.reports.tidy import is_results, read_results, read_study, write_files, write_results
 
-from .small_study import RECIPE, STUDY, table, write_run
+from .small_study import RECIPE, STUDY, table, write_run, write_study
 
 
 @pytest.fixture(scope="module")
-def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+def folders(unfinished: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """The runs of a study, one of them missing and one not at its end; and the files of their numbers."""
-    runs, results = tmp_path_factory.mktemp("runs"), tmp_path_factory.mktemp("results")
-    write_run(runs, STUDY, "hand_v2_her", [0.0, 0.1, 0.3, 0.9])
-    write_run(runs, STUDY, "hand_v2_filtered_her", [0.5, 0.7, 0.9, 1.0])
-    write_run(runs, STUDY, "robot_v2_her", [0.25, 0.25, 0.25, 0.35], epochs=2)
-    return runs, write_results(STUDY, runs, results / "bias")
+    return unfinished, write_results(STUDY, unfinished, tmp_path_factory.mktemp("results") / "bias")
 
 
 def combination(label: str, rows: list[dict[str, float]]) -> Combination:
@@ -49,14 +44,16 @@ def combination(label: str, rows: list[dict[str, float]]) -> Combination:
 
 def test_reports_from_files_are_those_from_runs(folders: tuple[Path, Path], tmp_path: Path) -> None:
     runs, results = folders
-    pages = [write_report(STUDY, folder, tmp_path / folder.name) for folder in (runs, results)]
-    names = sorted(path.name for path in pages[0].parent.glob("*.csv"))
+    study, made = str(write_study(tmp_path)), tmp_path / "report"
+    assert main(["report", study, "--folder", str(results), "--out", str(made)]) == 0
+    reports = (runs / "report", made)
+    names = sorted(path.name for path in made.glob("*.csv"))
     assert names == ["curves.csv", "differences.csv", "final.csv", "orders.csv", "runs.csv"]
     for name in names:
-        first, second = (table(page.parent / name) for page in pages)
+        first, second = (table(report / name) for report in reports)
         assert len(first) > 2
         assert first == second
-    figures = [{path.name: path for path in (page.parent / "figures").glob("*.png")} for page in pages]
+    figures = [{path.name: path for path in (report / "figures").glob("*.png")} for report in reports]
     assert len(figures[0]) > 10
     assert figures[0].keys() == figures[1].keys()
     for name, path in figures[0].items():
@@ -177,14 +174,3 @@ def test_damaged_files_are_named(folders: tuple[Path, Path], tmp_path: Path) -> 
     (out / "about.yaml").unlink()
     with pytest.raises(ValueError, match="has no run of the study bias"):
         read_study(STUDY, out)
-
-
-def test_the_command_line_reads_them_too(tmp_path: Path) -> None:
-    write_run(tmp_path / "runs", STUDY, "robot_v2_her", [0.5, 0.7])
-    results = write_results(STUDY, tmp_path / "runs", tmp_path / "results")
-    about = yaml.safe_dump({"summary": "small", "recipe": RECIPE, "vary": STUDY.vary}, sort_keys=False)
-    (tmp_path / "bias.yaml").write_text(about)
-    out = tmp_path / "report"
-    assert main(["report", str(tmp_path / "bias.yaml"), "--folder", str(results), "--out", str(out)]) == 0
-    (row,) = (row for row in table(out / "final.csv") if row["measure"] == "success")
-    assert (row["task"], row["algorithm"], row["iqm"]) == ("robot_v2", "her", "0.6")
