@@ -1,19 +1,25 @@
-"""Wall-clock and frames to a success rate, beside Stable-Baselines3 and SBX with HER: one curve a seed.
+"""Seconds and frames to a success rate, beside Stable-Baselines3 and SBX with HER: one curve for each seed.
 
     python benchmarks/time_to_learn.py --out time_to_learn.md
     python benchmarks/time_to_learn.py --preset benchmarks/presets/fetch_push.yaml --only SBX-SAC \\
         --aim 2 --repeats 5 --epochs 12 --epoch-frames 10000 --curves push_sac
+    python benchmarks/time_to_learn.py --task gym:FetchPush-v4 --only this Zoo-TQC Zoo-SAC Zoo-SBX-TQC \\
+        --aim 0.95 --window 2 --minutes 60 --epochs 200 --epoch-frames 5000 --first-seed 100 --repeats 1 \\
+        --curves push_seconds
 
 All train in as many worlds of the same task with the same networks, batches, discount and number of
-gradient steps; all are asked every epoch for the success of greedy episodes in the same environment, which
-is not timed. Runs are taken in turns, and end where the aim is reached (never, if it is above 1). With
-``--curves`` a run is written when it ends, and is not made again: each setting needs a file of its own.
+gradient steps, except the contenders named Zoo, which have the RL Zoo's options for the task. After each
+epoch the success of greedy episodes in the same environment is measured, which is not timed. Seconds are
+those of processor time, on one core. Runs are taken in turns. Each ends when its last evaluations reach the
+aim on average (never, if the aim is above 1). With ``--curves`` a run is written when it ends, and is not
+made again: each setting needs a file of its own.
 """
 
 from __future__ import annotations
 
 import argparse
 import csv
+import math
 import statistics
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -26,17 +32,18 @@ from matplotlib.figure import Figure
 from peers.sb3 import make_sb3
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from tensordict import TensorDictBase
+from torchrl.envs import EnvBase
 
-from torchrl_her import evaluate, success
-from torchrl_her_envs import goal_env
+from torchrl_her import success
 from torchrl_her_recipes import Recipe, build, make_recipe
-from torchrl_her_recipes.components.envs import TaskEnvs
+from torchrl_her_recipes.components.envs import TaskEnvs, evaluation_envs, play_episodes
 from torchrl_her_recipes.config.shipped import load_preset
 from torchrl_her_recipes.config.shortcuts import merge
 
 HAND = merge(load_preset("throwing"), {"task": "hand_v0", "algo": "her"})
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
+Learned = tuple[Policy, EnvBase]  # a greedy policy and environments to evaluate it in
 
 
 class Point(NamedTuple):
@@ -47,31 +54,44 @@ class Point(NamedTuple):
     success: float
 
 
-def ours(recipe: Recipe, _noise: float) -> Iterator[Policy]:
+def ours(recipe: Recipe, _noise: float) -> Iterator[Learned]:
     """Trains, and hands out the greedy policy after each epoch. Explores as the recipe says."""
     components = build(recipe)
-    if components.curriculum is not None:
+    if components.curriculum is not None and not components.curriculum.progress.by_episode:
         raise ValueError(f"algo={recipe.hindsight.algo} climbs in torchrl-her train only, not here")
     trainer = components.trainer()
     while True:
         trainer.epoch()
-        yield components.policy
+        yield components.player, components.eval_env
 
 
-def ddpg(recipe: Recipe, noise: float) -> Iterator[Policy]:
+def ddpg(recipe: Recipe, noise: float) -> Iterator[Learned]:
     """The same of Stable-Baselines3's DDPG."""
     return _learn(recipe, make_sb3(recipe, noise=noise))
 
 
-def sac(recipe: Recipe, _noise: float) -> Iterator[Policy]:
+def sac(recipe: Recipe, _noise: float) -> Iterator[Learned]:
     """The same of SBX's SAC, which explores by the entropy of its policy."""
     from peers.sbx_sac import make_sac  # noqa: PLC0415  # only those who ask for it wait for JAX
 
     return _learn(recipe, make_sac(recipe))
 
 
-def _learn(recipe: Recipe, model: OffPolicyAlgorithm) -> Iterator[Policy]:
+def zoo(algorithm: str) -> Callable[[Recipe, float], Iterator[Learned]]:
+    """The same of an algorithm with the RL Zoo's options for the task; the recipe gives task and seed."""
+
+    def train(recipe: Recipe, _noise: float) -> Iterator[Learned]:
+        from peers.zoo import make_zoo  # noqa: PLC0415  # as above
+
+        return _learn(recipe, make_zoo(algorithm, recipe))
+
+    return train
+
+
+def _learn(recipe: Recipe, model: OffPolicyAlgorithm) -> Iterator[Learned]:
     """Trains a peer's model, and hands out its greedy policy after each epoch."""
+    worlds = evaluation_envs(recipe.task.name, recipe.evaluation.episodes)
+    env = TaskEnvs.of(recipe).make(worlds, [recipe.run.seed + (1 << 32)], scaled=False)
 
     def policy(tensordict: TensorDictBase) -> TensorDictBase:
         keys = ("observation", "achieved_goal", "desired_goal")
@@ -80,30 +100,31 @@ def _learn(recipe: Recipe, model: OffPolicyAlgorithm) -> Iterator[Policy]:
 
     while True:
         model.learn(recipe.collection.epoch_frames, reset_num_timesteps=False)
-        yield policy
+        yield policy, env
 
 
 Curves = Mapping[str, Sequence[Sequence[Point]]]  # of each seed, by contender
 Runs = dict[tuple[str, int], list[Point]]  # by contender and seed
 
-CONTENDERS = {"this": ours, "Stable-Baselines3": ddpg, "SBX-SAC": sac}
+CONTENDERS = {"this": ours, "Stable-Baselines3": ddpg, "SBX-SAC": sac} | {
+    f"Zoo-{name}": zoo(name) for name in ("TQC", "SAC", "SBX-TQC")
+}
 
 
-def race(name: str, recipe: Recipe, *, noise: float, aim: float) -> list[Point]:
-    """The curve until the aim, or until the recipe's last epoch."""
-    test = TaskEnvs.of(recipe).make(recipe.evaluation.episodes, [recipe.run.seed + (1 << 32)])
+def race(name: str, recipe: Recipe, *, noise: float, aim: float, window: int, minutes: float) -> list[Point]:
+    """The curve until the mean of the last evaluations is at the aim, the last epoch, or the time is up."""
     curve: list[Point] = []
     training, seconds = CONTENDERS[name](recipe, noise), 0.0
     for epoch in range(1, recipe.run.epochs + 1):
-        began = time.perf_counter()
-        policy = next(training)
-        seconds += time.perf_counter() - began
-        rollout = evaluate(test, policy, max_steps=goal_env(test).max_steps)
-        curve.append(
-            Point(epoch * recipe.collection.epoch_frames, seconds, float(success(rollout).float().mean()))
-        )
+        began = time.process_time()
+        policy, env = next(training)
+        seconds += time.process_time() - began
+        rollout = play_episodes(env, policy, recipe.evaluation.episodes)
+        frames, share = epoch * recipe.collection.epoch_frames, success(rollout).float().mean().item()
+        curve.append(Point(frames, seconds, share))
         print(f"{name}, seed {recipe.run.seed}: {curve[-1]}", flush=True)
-        if curve[-1].success >= aim:
+        last = [point.success for point in curve[-window:]]
+        if (len(last) == window and statistics.fmean(last) >= aim) or seconds >= 60 * minutes:
             break
     return curve
 
@@ -114,12 +135,13 @@ def column(values: Sequence[float], form: str) -> str:
     )
 
 
-def line(name: str, curves: Sequence[Sequence[Point]], aim: float) -> list[str]:
-    """A row of the table: one number a seed."""
+def line(name: str, curves: Sequence[Sequence[Point]], aim: float, window: int) -> list[str]:
+    """A row of the table: one number for each seed."""
     best = [max(point.success for point in curve) for curve in curves]
+    ends = [statistics.fmean(point.success for point in curve[-window:]) for curve in curves]
     return [
         name,
-        f"{sum(value >= aim for value in best)} of {len(curves)}",
+        f"{sum(value >= aim for value in ends)} of {len(curves)}",
         column([curve[-1].seconds for curve in curves], ".0f"),
         column([curve[-1].frames for curve in curves], ",.0f"),
         column([curve[-1].success for curve in curves], ".0%"),
@@ -153,7 +175,7 @@ def draw_curves(curves: Curves, path: Path, *, title: str) -> None:
     figure = Figure(figsize=(9.4, 3.8), layout="constrained")
     panels = figure.subplots(1, 2, sharey=True)
     for axes, field in zip(panels, ("frames", "seconds"), strict=True):
-        for name, color in zip(curves, ("#2b6cb0", "#dd6b20", "#2f855a"), strict=False):
+        for name, color in zip(curves, ("#2b6cb0", "#dd6b20", "#2f855a", "#805ad5"), strict=False):
             for seed, curve in enumerate(curves[name]):
                 label = name if seed == 0 else None
                 places = [getattr(point, field) for point in curve]
@@ -172,10 +194,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--preset", help="of torchrl-her (default: HER on hand_v0)")
+    parser.add_argument("--task", help="the default agent on this task, in place of a preset")
     parser.add_argument("--only", nargs="+", choices=CONTENDERS, default=["this", "Stable-Baselines3"])
     parser.add_argument("--aim", type=float, default=0.8, help="success at which a run ends")
     parser.add_argument("--noise", type=float, default=0.1, help="of Stable-Baselines3's actions")
-    parser.add_argument("--repeats", type=int, default=3, help="seeds")
+    parser.add_argument("--window", type=int, default=1, help="evaluations whose mean has to be at the aim")
+    parser.add_argument("--minutes", type=float, default=math.inf, help="of training, after which a run ends")
+    parser.add_argument("--repeats", type=int, default=3, help="number of seeds")
+    parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--epochs", type=int, help="in place of the preset's")
     parser.add_argument("--epoch-frames", type=int, help="likewise")
     parser.add_argument("--out", type=Path, help="a Markdown file to write the table to, too")
@@ -184,18 +210,21 @@ def main(arguments: Sequence[str] | None = None) -> None:
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
     values: dict[str, Any] = load_preset(options.preset) if options.preset else HAND
+    values = {"task": {"name": options.task}} if options.task else values
+    seeds = range(options.first_seed, options.first_seed + options.repeats)
     asked = {"epochs": options.epochs, "epoch_frames": options.epoch_frames}
     asked = {name: value for name, value in asked.items() if value is not None}
     kept = options.curves and options.curves.with_suffix(".csv")
     runs = read_runs(kept) if kept else {}
-    for seed in range(options.repeats):
+    for seed in seeds:
         recipe = make_recipe(values, seed=seed, **asked)
         for name in options.only:
             if (name, seed) not in runs:
-                runs[name, seed] = race(name, recipe, noise=options.noise, aim=options.aim)
+                limits = {"aim": options.aim, "window": options.window, "minutes": options.minutes}
+                runs[name, seed] = race(name, recipe, noise=options.noise, **limits)
                 if kept:
                     write_runs(runs, kept)
-    curves = {name: [runs[name, seed] for seed in range(options.repeats)] for name in options.only}
+    curves = {name: [runs[name, seed] for seed in seeds] for name in options.only}
     header = (
         recipe.task.name,
         f"reached {options.aim:.0%}",
@@ -204,7 +233,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "last",
         "best",
     )
-    rows = [line(name, curves[name], options.aim) for name in options.only]
+    rows = [line(name, curves[name], options.aim, options.window) for name in options.only]
     text = "\n\n".join((describe("torch", "torchrl", "stable-baselines3"), table(header, rows)))
     publish(text, options.out)
     if options.curves is not None:
