@@ -10,4 +10,4 @@ from torchrl_her_envs.gym.registration import register_gym_ids as _register_gym_
 
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
-_register_gym_ids()  # gymnasium knows the throwing tasks from here on
+_register_gym_ids()  # from here on, gymnasium.make accepts their ids

@@ -30,11 +30,11 @@ class TaskSpec:
         family: group of tasks that it belongs to, such as ``"throwing"`` or ``"toy"``.
         make: the function or class that makes the environment, as ``"module:name"``; it is imported when
             it is first used. It takes ``num_envs``, ``seed``, the arguments and the options.
-        arguments: arguments that it is always given, besides the options.
+        arguments: arguments that ``make`` always gets, besides the options.
         options: all options that the task takes, with their defaults.
-        actions: kind of its actions; None if only its environment can tell.
+        actions: kind of its actions; None if this is unknown before its environment is made.
         takes_others: whether it may take further options, which are only known when it is made.
-        for_pictures: options with which its environments give pictures, if they need any.
+        for_pictures: options that its environments need in order to be rendered.
 
     Example:
         >>> get_task_spec("bit_flip").options
@@ -59,7 +59,7 @@ def register_task(spec: TaskSpec) -> None:
     """Registers a task for :func:`make_env`.
 
     Args:
-        spec: its name, and how to make it.
+        spec: description of the task.
 
     Raises:
         ValueError: the name is taken or has a colon, or ``make`` is not of the form ``"module:name"``.
@@ -110,7 +110,7 @@ def get_task_spec(name: str) -> TaskSpec:
 
 
 def module_of(name: str) -> str:
-    """Returns the user's module that making a task imports, from the task's name.
+    """Returns the name of the user's module that :func:`make_env` imports for a task.
 
     Returns:
         The module's name; empty for tasks of this package and for those that gymnasium has registered.
@@ -124,7 +124,7 @@ def module_of(name: str) -> str:
 
 
 def check_task(name: str) -> None:
-    """Raises a ValueError for an unknown task, which lists all tasks and suggests the nearest name.
+    """Raises a ValueError for an unknown task; the message lists all tasks and suggests the nearest name.
 
     An unknown ID in ``gym:ID``, or a function that its module lacks, raises an error only when the
     environment is made.

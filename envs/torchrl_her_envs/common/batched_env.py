@@ -1,4 +1,4 @@
-"""The base class of environments that are a batch of tensors: episodes, ends, rewards and resuming."""
+"""Base class of environments whose state is a batch of tensors, with episodes, rewards and resuming."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _COUNTERS = ("step", "episode")  # entries of the state that are counters and no
 
 
 class BatchedEnv(GoalEnv):
-    """N environments: their state is a dataclass of tensors with N rows; each has its own random key.
+    """Base class of N environments, whose state is tensors of N rows; each environment has a random key.
 
     Subclasses define how episodes start (:meth:`_start_episodes`), what an action does (:meth:`_advance`),
     what the agent observes (:meth:`_show`) and when a goal is achieved (:meth:`compute_terminated`). All
@@ -50,21 +50,21 @@ class BatchedEnv(GoalEnv):
 
     def __init__(self, num_envs: int) -> None:
         super().__init__(device="cpu", batch_size=(num_envs,))
-        self._packed = False  # whether observations were checked
+        self._packed = False  # whether TensorDict has checked the entries
 
     # Methods that subclasses implement
 
     @abstractmethod
     def compute_terminated(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
-        """Returns whether the goal is achieved, which ends an episode: [..., 1] of bool."""
+        """Returns whether goals are achieved, which ends an episode, as bool [..., 1]."""
 
     @abstractmethod
     def _start_episodes(self, which: Tensor) -> None:
-        """Draws the starts of new episodes in the given environments [M], after updating counters."""
+        """Draws the starts of new episodes in the given environments [M], whose counters are updated."""
 
     @abstractmethod
     def _advance(self, action: Tensor) -> Tensor | None:
-        """Takes a step with checked actions; returns which episodes [N] it ends without success, if any."""
+        """Takes a step with checked actions; returns a mask [N] of episodes that fail in it, or None."""
 
     @abstractmethod
     def _show(self) -> dict[str, Tensor]:
@@ -75,7 +75,7 @@ class BatchedEnv(GoalEnv):
         """Raises a ValueError for invalid actions."""
 
     def _is_achieved(self, entries: dict[str, Tensor]) -> Tensor:
-        """Returns whether each environment is at its goal: [N, 1] of bool."""
+        """Returns whether each environment is at its goal, as bool [N, 1]."""
         return self.compute_terminated(entries["achieved_goal"], entries["desired_goal"])
 
     # Methods that subclasses inherit
@@ -88,10 +88,10 @@ class BatchedEnv(GoalEnv):
             desired_goal: [..., g], broadcast against it.
 
         Returns:
-            [..., 1]: 0 where the goal is achieved, -1 elsewhere.
+            Rewards [..., 1]: 0 where the goal is achieved, -1 elsewhere.
 
         Raises:
-            ValueError: goals of another width than g, where the task checks it.
+            ValueError: goals do not have width g, in tasks that check this.
         """
         return self.compute_terminated(achieved_goal, desired_goal).to(achieved_goal.dtype) - 1.0
 
@@ -145,7 +145,7 @@ class BatchedEnv(GoalEnv):
         entries = [field.name for field in fields(self.worlds) if field.name not in _COUNTERS]
         self._check_starts(states, which, entries)
         for name in entries:
-            getattr(self.worlds, name)[which] = states[name]  # in place: others may share the memory
+            getattr(self.worlds, name)[which] = states[name]  # in place: other objects may share the memory
         self.worlds.step[which] = 0
         return self._show()
 
@@ -267,7 +267,7 @@ class BatchedEnv(GoalEnv):
         Args:
             observed: number of entries of an observation.
             goals: number of coordinates of a goal.
-            seen: makes the spec of a state, an observation or a goal from its shape.
+            seen: function that makes the spec of a state, an observation or a goal from its shape.
             action: the spec of actions.
         """
         (n,) = self.batch_size
@@ -288,7 +288,7 @@ class BatchedEnv(GoalEnv):
 
 
 def _cleared(entry: Tensor | TensorDictBase, rows: Tensor) -> Any:
-    """Returns an entry [N, ...] with zeros in some rows [N, 1]."""
+    """Returns an entry [N, ...] with zeros in the rows that a mask [N, 1] selects."""
     if isinstance(entry, Tensor):
         return entry.masked_fill(rows.view(-1, *[1] * (entry.ndim - 1)), 0)
     return entry.apply(lambda part: _cleared(part, rows))

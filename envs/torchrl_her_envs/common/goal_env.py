@@ -17,8 +17,8 @@ from torchrl_her_envs.common.rendering.pictures import captioned
 
 E = TypeVar("E", bound=EnvBase)
 Box = tuple[list[float], list[float]]  # the least and the greatest coordinates
-Names = str | Sequence[str]  # of an entry that an environment shows, or of several
-INFO = "info"  # the entry of transitions with all that rewards read besides goals
+Names = str | Sequence[str]  # name of an entry of observations, or of several
+INFO = "info"  # entry of transitions for the values that rewards read besides goals
 _HAIR = 1e-6  # width of the bounds of a fixed action, relative to its value
 
 
@@ -31,7 +31,7 @@ class GoalEnv(EnvBase):
     Attributes:
         max_steps: length of the longest episode.
         missed_reward, achieved_reward: rewards of a missed and of an achieved goal.
-        dense_reward: whether there are many rewards besides these two.
+        dense_reward: whether missed goals have many different rewards.
     """
 
     max_steps: int
@@ -83,7 +83,7 @@ class GoalEnv(EnvBase):
 
     @property
     def can_render(self) -> bool:
-        """Whether :meth:`render` gives pictures."""
+        """Whether :meth:`render` returns pictures."""
         return False
 
     @property
@@ -120,7 +120,7 @@ class GoalEnv(EnvBase):
         raise ValueError(f"{self.task_name} has no curriculum: give its stages as curriculum=FILE.yaml")
 
     def state_names(self) -> dict[str, list[int]]:
-        """Names for entries of the state, which is the observation with the desired goal behind it.
+        """Returns names for entries of the state, which is the observation with the desired goal behind it.
 
         The stages of a curriculum may use them in place of indices.
 
@@ -133,10 +133,10 @@ class GoalEnv(EnvBase):
         return {"observation": list(range(observed)), "desired_goal": list(range(observed, observed + goal))}
 
     def action_limits(self) -> tuple[Tensor, Tensor]:
-        """Returns the lowest and the highest action, [entries] each, of the type that the task itself takes.
+        """Returns the lowest and the highest action, [entries] each, in the dtype of the task itself.
 
-        Both are equal where the task fixes an entry; the bounds of ``action_spec`` differ there, too, since
-        actions are scaled by their difference.
+        Both are equal where the task fixes an entry. The bounds of ``action_spec`` differ even there, since
+        actions are scaled by the difference of the bounds.
 
         Example:
             >>> from torchrl_her_envs import make_env
@@ -157,10 +157,10 @@ class GoalEnv(EnvBase):
         return None
 
     def picture_box(self) -> Box | None:
-        """Returns coordinates of a picture's corners, (left, bottom) and (right, top); None without a scale.
+        """Returns coordinates of a picture's corners, (left, bottom) and (right, top); None if unknown.
 
-        Goals can be drawn on a picture only if this is known. It is larger than :meth:`goal_box` where
-        pictures have a margin.
+        Goals can be drawn on a picture only if these coordinates are known. If pictures have a margin, this
+        box is larger than :meth:`goal_box`.
 
         Example:
             >>> from torchrl_her_envs import make_env
@@ -170,7 +170,7 @@ class GoalEnv(EnvBase):
         return None
 
     def regions(self) -> dict[str, Box]:
-        """Boxes to draw over pictures, by name, in the coordinates that the agent sees.
+        """Returns boxes to draw over pictures, by name, in the coordinates that the agent sees.
 
         Example:
             >>> from torchrl_her_envs import make_env
@@ -203,8 +203,7 @@ class GoalEnv(EnvBase):
             Pictures [len(worlds), height, width, 3] of uint8; without the first dimension for one index.
 
         Raises:
-            ValueError: the environment gives no pictures, an index is out of range, or the machine lacks what
-                drawing needs.
+            ValueError: the environment gives no pictures, an index is out of range, or rendering fails.
         """
         pictures = self._draw_worlds(choose_indices(self.batch_size[0], worlds), size)
         pictures = [captioned(picture, caption) for picture in pictures]
@@ -232,7 +231,7 @@ def goal_env(env: EnvBase) -> GoalEnv:
 
 
 def first_below(env: object, kind: type[E], what: str) -> E:
-    """Returns the environment, or the first one below its transforms, that is of a class.
+    """Returns the first environment of a class, from an environment down through its transforms.
 
     Raises:
         TypeError: no such environment is found; the message says that ``what`` was expected.
@@ -246,7 +245,7 @@ def first_below(env: object, kind: type[E], what: str) -> E:
 
 
 def choose_indices(count: int, worlds: int | Sequence[int] | None) -> list[int]:
-    """Returns the indices of environments that a user's argument means, checked.
+    """Converts the argument ``worlds`` to a list of indices of environments, and checks them.
 
     Args:
         count: number of environments in the batch.
@@ -268,7 +267,7 @@ def choose_indices(count: int, worlds: int | Sequence[int] | None) -> list[int]:
 
 
 def bounded_actions(low: Tensor, high: Tensor, count: int) -> Bounded:
-    """Makes the spec of actions [count, entries] of float32 from the bounds of one environment, in any shape.
+    """Makes the spec of float32 actions [count, entries] from one environment's bounds, of any shape.
 
     A fixed entry, ``low`` = ``high``, gets a tiny width, since scaling actions divides by the width.
 
@@ -282,7 +281,7 @@ def bounded_actions(low: Tensor, high: Tensor, count: int) -> Bounded:
 
 
 def info_rows(transitions: TensorDictBase, names: Iterable[str], shape: torch.Size) -> dict[str, Tensor]:
-    """Entries of transitions that rewards read, [..., w] each, broadcast to a shape [...] of pairs of goals.
+    """Returns entries [..., w] of transitions that rewards read, broadcast to the shape of pairs of goals.
 
     Example:
         >>> from tensordict import TensorDict
@@ -295,7 +294,7 @@ def info_rows(transitions: TensorDictBase, names: Iterable[str], shape: torch.Si
 
 
 def needs_info(env: GoalEnv) -> str:
-    """Writes the message for rewards that read more than goals, where only goals are given."""
+    """Returns the message for rewards that read info besides goals, if no info is given."""
     return (
         f"compute_reward of {env.task_name} reads {env.info_keys} of transitions: pass them, as in "
         "EnvReward(env.compute_reward, env.compute_terminated, info_keys=env.info_keys)"

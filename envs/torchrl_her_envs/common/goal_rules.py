@@ -12,23 +12,23 @@ Termination = Literal["auto", "own", "success", "reward", "never", "watch"]
 Ends = Literal["own", "success", "reward", "never", "watch"]
 
 _LOGGER = logging.getLogger("torchrl_her_envs")
-_MOST_VALUES = 2  # different rewards of goals that are not achieved, in a sparse reward
-_SHOWN = 3  # rewards in a message
+_MOST_VALUES = 2  # most different rewards of missed goals in a sparse reward
+_SHOWN = 3  # number of rewards in a message
 _DIGITS = 5  # decimal places to which rewards are compared
 _said: set[str] = set()
 
 
 def say_once(line: str) -> None:
-    """Logs a line once per process; nothing if it is empty."""
+    """Logs a line once per process; does nothing for an empty line."""
     if line and line not in _said:
         _said.add(line)
         _LOGGER.info(line)
 
 
 def warn_once(line: str) -> None:
-    """Logs a warning once per process; nothing if it is empty.
+    """Logs a warning once per process; does nothing for an empty line.
 
-    Without any handler, Python prints such a record as one line; a ``UserWarning`` would be two, with code.
+    Without a log handler, Python prints the record as one line; a ``UserWarning`` takes two, one with code.
     """
     if line and line not in _said:
         _said.add(line)
@@ -36,10 +36,10 @@ def warn_once(line: str) -> None:
 
 
 def check_termination(word: str) -> Termination:
-    """Returns a value of ``termination``, checked.
+    """Returns the value of the option ``termination``, checked.
 
     Raises:
-        ValueError: it is none of them.
+        ValueError: the value is not an allowed word.
 
     Example:
         >>> check_termination("sucess")
@@ -64,7 +64,7 @@ class GoalEnds:
     Attributes:
         rule: rule that ends episodes: the environment's own function (``"own"``), its ``is_success``
             (``"success"``) or the reward of a goal (``"reward"``); ``"never"`` if goals end none; ``"watch"``
-            while the environment's own ends count and no rule is set.
+            while the environment's own ends count and no rule is chosen.
         steps: number of steps so far.
         ended, went_on: numbers of steps at achieved goals in which the environment ended or continued the
             episode.
@@ -200,13 +200,13 @@ def check_stateless(name: str, before: np.ndarray, after: np.ndarray) -> None:
 def check_rewards(
     name: str, equal: float, others: Sequence[float] | np.ndarray, given: float | None
 ) -> tuple[float, float, bool]:
-    """Finds the reward of an achieved goal; raises if rewards are dense and none was given.
+    """Finds the reward of an achieved goal; raises if rewards are dense and ``given`` is None.
 
     Args:
         name: name of the environment, for messages.
         equal: the least reward of two equal goals.
         others: rewards of further pairs of goals.
-        given: the reward from which on a goal counts as achieved, if the user said so.
+        given: the user's choice of the least reward of an achieved goal; None if not set.
 
     Returns:
         The reward of a missed goal (the least reward seen), the reward of an achieved goal (the least that
@@ -261,8 +261,8 @@ def equal_with_info(name: str, equal: np.ndarray, others: np.ndarray, given: flo
     Args:
         name: name of the environment, for the message.
         equal: rewards [n] of equal goals, with different infos.
-        others: rewards of other pairs.
-        given: the reward from which on a goal counts as achieved, if the user said so.
+        others: rewards of other pairs of goals.
+        given: the user's choice of the least reward of an achieved goal; None if not set.
 
     Raises:
         ValueError: equal goals give no higher reward than others, and ``given`` is None.
@@ -299,7 +299,7 @@ def _missed(equal: float, others: Sequence[float] | np.ndarray) -> np.ndarray:
 
 
 def check_same_rewards(name: str, stepped: np.ndarray, computed: np.ndarray) -> str:
-    """Returns a warning if rewards of steps [n] differ from those computed for their goals, else nothing.
+    """Returns a warning if rewards of steps [n] differ from those computed for their goals, else "".
 
     Steps in which an episode failed are left out, since virtual transitions keep the cost of a failure.
 

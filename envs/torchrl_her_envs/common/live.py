@@ -42,7 +42,7 @@ class LiveEpisodes:
 
     Raises:
         TypeError: ``env`` has no environment with goals below it.
-        ValueError: it gives no pictures, or an index is out of range.
+        ValueError: the environment gives no pictures, or an index is out of range.
 
     Example:
         >>> from torchrl_her_envs import make_env

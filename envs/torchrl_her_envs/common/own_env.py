@@ -1,4 +1,4 @@
-"""A TorchRL environment of a user's own, named as ``module:function``, as an environment with goals."""
+"""Wraps a user's TorchRL environment, given as ``module:function``, as an environment with goals."""
 
 from __future__ import annotations
 
@@ -40,10 +40,10 @@ from torchrl_her_envs.common.seeding import as_seeds, block_keys
 KEYS = ("observation", "achieved_goal", "desired_goal")
 _GOALS = KEYS[1:]
 _SUCCESS = "is_success"
-# Options that every such environment takes.
+# Options of make_own_env itself, which each environment takes.
 _OURS = ("max_steps", "termination", "achieved_reward", "info_keys", *(f"{key}_key" for key in KEYS))
 _TRIED_STEPS = 100
-_PAIRED = 8  # goals of each kind whose pairs are tried
+_PAIRED = 8  # number of achieved and of desired goals that are paired to try rewards
 
 
 def make_own_env(
@@ -60,31 +60,31 @@ def make_own_env(
     desired_goal_key: Names = "desired_goal",
     **options: Any,
 ) -> EnvBase:
-    """Makes a batch of an environment of the user's own.
+    """Makes a batch of a user's own environment.
 
     Args:
-        path: ``"module:name"`` of a function or class that gives a TorchRL ``EnvBase``; the module is
-            imported. If it takes ``num_envs``, it must give environments of batch size ``[num_envs]``; it
-            also gets ``seed`` and ``max_steps`` if it takes them, and with R seeds is called once if the
-            environments have ``set_seeds``, or else R times. If not, it is called ``num_envs`` times and must
-            give environments without a batch size, which are stepped one after the other.
+        path: ``"module:name"`` of a function or class that makes a TorchRL ``EnvBase``; the module is
+            imported. ``seed`` and ``max_steps`` are passed if it takes them. If it takes ``num_envs``, it
+            must make environments of batch size ``[num_envs]``; with R seeds it is called once if these have
+            ``set_seeds``, otherwise R times. If not, it is called ``num_envs`` times and must make
+            environments without a batch size, which are stepped one after the other.
         num_envs: number of environments.
         seed: seed of all environments; R seeds for R equal blocks of them.
         max_steps: length of an episode; the environment's attribute ``max_steps`` if None.
         termination: rule that ends an episode at its goal, see :class:`OwnGoalEnv`.
-        achieved_reward: the reward from which on a goal counts as achieved, for dense rewards.
+        achieved_reward: the least reward at which a goal counts as achieved, for dense rewards.
         info_keys: entries of a step that rewards read besides goals, see :class:`OwnGoalEnv`.
         observation_key, achieved_goal_key, desired_goal_key: the environment's names of these entries. The
-            entries in a list are joined in their order; the environment's functions get dictionaries of them.
-        options: for the function.
+            entries of a list are joined in order; the environment's functions get them as a dictionary.
+        options: options of the function.
 
     Returns:
         The environments themselves if they are :class:`~torchrl_her_envs.GoalEnv`; otherwise an
         :class:`OwnGoalEnv` around them.
 
     Raises:
-        ValueError: there is no such module or name, it gives no ``EnvBase``, or the environment lacks an
-            entry or a method.
+        ValueError: there is no such module or name, the function makes no ``EnvBase``, or the environment
+            lacks an entry or a method.
 
     Example:
         >>> env = make_own_env("torchrl_her_envs:BitFlip", num_envs=2, bits=4)
@@ -99,7 +99,7 @@ def make_own_env(
     taken = inspect.signature(signed).parameters
     _check_options(path, taken, options)
     if not isinstance(seed, int) and len(seed) == 1:
-        (seed,) = seed  # of a single run: what an environment of one's own expects
+        (seed,) = seed  # a single integer, which users' environments expect
 
     def make_one(count: int, seed: int | Sequence[int]) -> EnvBase:
         offered = {"num_envs": count, "seed": seed, "max_steps": max_steps}
@@ -113,7 +113,7 @@ def make_own_env(
             return [make_one(1, seed) for _ in range(count)]
         if isinstance(seed, int):
             return [make_one(count, seed)]
-        block_keys(seed, count)  # whether they can be shared out
+        block_keys(seed, count)  # raises if they cannot be shared out
         share = count // len(seed)
         first = make_one(share, seed[0])
         if callable(getattr(first, "set_seeds", None)):  # it takes several seeds
@@ -166,7 +166,7 @@ def _load(path: str) -> Callable[..., Any]:
         make = getattr(importlib.import_module(module), name, None)
     except ModuleNotFoundError as error:
         if error.name is None or not f"{module}.".startswith(f"{error.name}."):
-            raise  # a module that it needs
+            raise  # another module, which this one imports, is missing
         raise ValueError(
             f"there is no module {module!r} for task={path}, neither in this folder nor among the installed "
             "packages"
@@ -196,10 +196,10 @@ class GoalRules:
     """Rules by which an environment rewards goals and ends episodes.
 
     Args:
-        ends: what ends an episode at its goal, and what the environment was seen to do there.
+        ends: rule for the ends of episodes at goals, and counts of what the environment did there.
         missed_reward: the least reward that was seen.
         achieved_reward: the least reward of an achieved goal.
-        dense: whether there are many rewards besides these two.
+        dense: whether missed goals have many different rewards.
     """
 
     ends: GoalEnds
@@ -217,7 +217,7 @@ class OwnGoalEnv(GoalEnv):
 
     - ``compute_terminated(achieved_goal, desired_goal)``, which maps goals [..., g] to bool [..., 1]. If it
       is missing, ``termination`` says what ends an episode at its goal, as for
-      :class:`~torchrl_her_envs.GymGoalEnv`; an entry ``is_success`` of a step takes the place of its info.
+      :class:`~torchrl_her_envs.GymGoalEnv`; an entry ``is_success`` of a step replaces the one of ``info``.
     - Further entries that rewards depend on, if ``info_keys`` names them. Both functions then get a third
       argument, a dictionary of these entries [..., w] of the same step; for a virtual goal, too. Transitions
       have them as ``("info", KEY)``.
@@ -227,12 +227,12 @@ class OwnGoalEnv(GoalEnv):
     - ``set_seeds(seeds)`` of a batch, for R equal blocks; a batch without it has one seed.
 
     Args:
-        envs: N environments without a batch size, or some with a batch size, N together.
+        envs: N environments without a batch size, or batches of environments, N in total.
         name: name of the task.
         seed: seed of all environments; R seeds for R equal blocks of them.
         max_steps: length of an episode; the environment's attribute if None.
         termination: rule that ends an episode at its goal.
-        achieved_reward: the reward from which on a goal counts as achieved; the reward of equal goals if
+        achieved_reward: the least reward at which a goal counts as achieved; the reward of equal goals if
             None.
         rules: rules found for another such environment; None to find them by some steps.
         info_keys: entries of a step that rewards read besides goals.
@@ -240,7 +240,7 @@ class OwnGoalEnv(GoalEnv):
 
     Attributes:
         rules: how the environment rewards goals and ends episodes.
-        goal_ends: what ends an episode at its goal, and what the environment was seen to do there.
+        goal_ends: rule for the ends of episodes at goals, and counts of what the environment did there.
 
     Raises:
         ValueError: something is missing or cannot be used; the message names it.
@@ -277,13 +277,13 @@ class OwnGoalEnv(GoalEnv):
         self._latest: list[TensorDictBase] = []
         self._steps = torch.zeros(count, 1, dtype=torch.int64)
         if rules is None:
-            self.goal_ends = GoalEnds(name, env_ends=None, tells_success=True)  # while it is tried
+            self.goal_ends = GoalEnds(name, env_ends=None, tells_success=True)  # for the trial
             rules = self._try_out(check_termination(termination), achieved_reward)
         self.rules, self.goal_ends, self.dense_reward = rules, rules.ends, rules.dense
         self.missed_reward, self.achieved_reward = rules.missed_reward, rules.achieved_reward
         self.set_seeds(as_seeds(seed))
 
-    # What goal environments offer
+    # Interface of GoalEnv
 
     @property
     def task_name(self) -> str:
@@ -311,7 +311,7 @@ class OwnGoalEnv(GoalEnv):
     def compute_reward(
         self, achieved_goal: Tensor, desired_goal: Tensor, info: TensorDictBase | None = None
     ) -> Tensor:
-        """Returns the reward of having achieved one goal when another was desired: [..., 1] of float32."""
+        """Returns the reward, float32 [..., 1], of having achieved one goal when another was desired."""
         return self._ask("compute_reward", achieved_goal, desired_goal, info).float()
 
     def compute_terminated(
@@ -329,11 +329,11 @@ class OwnGoalEnv(GoalEnv):
             seeds: R seeds.
 
         Raises:
-            ValueError: the environments cannot be shared out among R blocks, a seed is out of range, or they
-                are batches without ``set_seeds``, and not R of them.
+            ValueError: the environments cannot be shared out among R blocks, a seed is out of range, or
+                ``envs`` are batches without ``set_seeds`` and not R in number.
         """
         keys = (block_keys(seeds, self.batch_size[0]) >> np.uint64(33)).tolist()
-        # Many environments seed torch's own generator, which the run uses, too.
+        # Many environments seed torch's own generator, which the run uses, too: its state is restored.
         with torch.random.fork_rng(devices=[]):
             if callable(set_seeds := getattr(self._envs[0], "set_seeds", None)) and self._whole:
                 set_seeds(seeds)
@@ -422,7 +422,7 @@ class OwnGoalEnv(GoalEnv):
         return [names] if isinstance(names, str) else names
 
     def _named(self, key: str, goals: Tensor) -> Any:
-        """Converts goals [..., g] to the environment's own form: several entries to a dictionary."""
+        """Converts goals [..., g] to the environment's own form: a dictionary if it has several entries."""
         if isinstance(self._names[key], str):
             return goals
         spec, names = self._envs[0].full_observation_spec, self._entries(key)
@@ -540,7 +540,7 @@ class OwnGoalEnv(GoalEnv):
         return space.low.flatten(), space.high.flatten()
 
     def _own_actions(self, actions: Tensor) -> Tensor:
-        """Actions of all environments in the shape, bounds and type of their own specs."""
+        """Converts actions of all environments to the shape, bounds and dtype of their own specs."""
         spec = self._envs[0].action_spec_unbatched
         if not isinstance(spec, Bounded):
             return actions.to(spec.dtype)
@@ -548,7 +548,7 @@ class OwnGoalEnv(GoalEnv):
         return rounded.to(spec.dtype).reshape(-1, *spec.shape).clamp(spec.space.low, spec.space.high)
 
     def _try_out(self, termination: Termination, achieved_reward: float | None) -> GoalRules:
-        """Finds out how the environment rewards and ends, with some steps of random actions."""
+        """Finds the environment's rules for rewards and ends by some steps of random actions."""
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(0)
             self.set_seeds([0])
@@ -571,7 +571,7 @@ class OwnGoalEnv(GoalEnv):
         stepped = after["reward"].flatten()
         computed = self.compute_reward(achieved, desired, after).flatten()
         reached = computed >= met
-        went_on = ~after["terminated"].flatten() | reached  # virtual goals keep the cost of failures
+        went_on = ~after["terminated"].flatten() | reached  # without failures, whose cost virtual goals keep
         warn_once(check_same_rewards(self._name, stepped[went_on].numpy(), computed[went_on].numpy()))
         first, env_ends = self._envs[0], None
         if callable(getattr(first, "compute_terminated", None)):

@@ -27,8 +27,8 @@ def record_episodes(env: EnvBase, policy: Policy, *, hold: int = 25, **options: 
 
     Raises:
         TypeError: ``env`` has no environment with goals below it.
-        ValueError: it gives no pictures, an index is out of range, ``size`` is too small, or ``columns`` is
-            below 1.
+        ValueError: the environment gives no pictures, an index is out of range, ``size`` is too small, or
+            ``columns`` is below 1.
 
     Example:
         >>> from torchrl_her_envs import make_env

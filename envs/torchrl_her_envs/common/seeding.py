@@ -97,10 +97,10 @@ def uniform(keys: np.ndarray, episodes: np.ndarray | Tensor, count: int) -> np.n
     Args:
         keys: [M] uint64, from :func:`env_keys`.
         episodes: [M] int64, the number of the episode in its environment.
-        count: number of numbers that an episode needs, at most 256.
+        count: how many numbers an episode needs, at most 256.
 
     Returns:
-        [M, count] of float64: an array for an array, a tensor for a tensor.
+        The numbers [M, count] in float64: an array or a tensor, as ``episodes`` is.
 
     Example:
         >>> u = uniform(env_keys(0, 2), torch.tensor([0, 0]), 3)

@@ -1,1 +1,1 @@
-"""From gymnasium to TorchRL, and back."""
+"""Conversion of environments from gymnasium to TorchRL, and back."""

@@ -1,4 +1,4 @@
-"""Checks on one gymnasium environment, before many are made, that it follows GoalEnv."""
+"""Checks that a gymnasium environment follows GoalEnv, before many of its kind are made."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ _OUR_OPTIONS = (
     *(f"{key}_key" for key in KEYS),
     "pictures",
 )
-EPISODES = 8  # states whose goals the environment's functions are tried with
+EPISODES = 8  # number of first states whose goals serve to try the environment's functions
 _TRIED_STEPS = 100
 _LIMIT_STEPS = 1_000  # random steps in which an environment may show its own time limit
 _LIMIT = 100  # steps of an episode, if no time limit shows
 _HALVINGS = 30
-_COARSE = 0.05  # steps of float32, relative to the standard deviation of a goal
+_COARSE = 0.05  # largest step of float32, relative to the standard deviation of a goal
 _NOISE = 1e-5  # standard deviation of an entry of goals, relative to the largest, below which it is noise
 
 
@@ -148,7 +148,7 @@ def _check_shown(id: str, space: spaces.Space) -> None:
 
 
 def check_methods(id: str, env: gymnasium.Env) -> None:
-    """Raises a ValueError if ``reset`` or ``step`` of an environment or its wrappers are those of old gym."""
+    """Raises a ValueError if ``reset`` or ``step`` of an environment or a wrapper has old gym's form."""
     wrappers = [env]
     while isinstance(wrappers[-1], gymnasium.Wrapper):
         wrappers.append(wrappers[-1].env)
@@ -183,7 +183,7 @@ def has_compute_terminated(env: gymnasium.Env, achieved: Any, desired: Any) -> b
         env.get_wrapper_attr(TERMINATED)(achieved, desired, {})
     except NotImplementedError:
         return False
-    except Exception:  # GoalFunction reports errors when it tries the function
+    except Exception:  # the function exists; GoalFunction reports its errors
         return True
     return True
 
@@ -193,7 +193,7 @@ def goals_to_try(env: gymnasium.Env, layout: Layout) -> tuple[np.ndarray, np.nda
     observations = [env.reset(seed=seed)[0] for seed in range(EPISODES)]
     achieved, desired = (np.stack([layout.flatten(obs[key]) for obs in observations]) for key in KEYS[1:])
     pairs = np.repeat(achieved, EPISODES, 0), np.tile(desired, (EPISODES, 1))
-    # M must be no dimension of a goal, see GoalFunction.
+    # M must differ from all dimensions of a goal, see GoalFunction.
     last = max(m for m in range(EPISODES * (EPISODES + 1) + 1) if m not in layout.sizes)
     achieved, desired = (np.concatenate([desired, goals])[:last] for goals in pairs)
     return achieved, desired

@@ -20,7 +20,7 @@ def draws(env: gymnasium.Env) -> bool:
 def choose_renderer() -> None:
     """Makes MuJoCo render by EGL if there is no display, unless ``MUJOCO_GL`` is set.
 
-    By itself it would try to open a window there, and fail.
+    Otherwise MuJoCo would try to open a window, and fail.
     """
     if sys.platform == "linux" and not any(os.environ.get(name) for name in _DISPLAYS):
         os.environ.setdefault(_DRAWN_BY, "egl")

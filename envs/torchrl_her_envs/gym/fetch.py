@@ -1,7 +1,7 @@
 """The Fetch tasks of gymnasium-robotics: names for entries of their states, and stages of a curriculum.
 
-A Fetch robot's gripper has to be brought to a point, or an object, which the gripper pushes, slides or
-carries: Plappert et al., Multi-goal reinforcement learning, 2018.
+A Fetch robot has to bring its gripper, or an object that it pushes, slides or carries, to a point: Plappert
+et al., Multi-goal reinforcement learning, 2018.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def _shown(id: str) -> dict[str, int] | None:
 
 
 def fetch_names(id: str) -> dict[str, list[int]]:
-    """Returns names for entries of a Fetch task's state; none for another environment.
+    """Returns names for entries of a Fetch task's state; an empty dictionary for other environments.
 
     Args:
         id: id of the environment in gymnasium.
@@ -51,7 +51,7 @@ def fetch_names(id: str) -> dict[str, list[int]]:
 
 
 def fetch_stages(id: str) -> list[dict[str, Any]]:
-    """Returns the stages of a Fetch task: reach the object, then move it; none for another environment.
+    """Returns the stages of a Fetch task: reach the object, then move it; [] for other environments.
 
     The goal of the first stage, the object's position, is what the second stage observes at the same inputs.
     Tasks of reaching a point have one stage. A block to be picked up must first be between the fingers.

@@ -1,4 +1,4 @@
-"""Any of gymnasium's environments with goals as a batched TorchRL environment."""
+"""Wraps gymnasium environments with goals as a batched TorchRL environment."""
 
 from __future__ import annotations
 
@@ -90,16 +90,16 @@ def make_gym_env(
         seed: seed of all environments; R seeds for R equal blocks of them, each as if alone.
         max_steps: length of an episode. If None, the registered length, or the length at which the
             environment truncates episodes of random actions, or 100.
-        parallel: a process for each environment, which pays where a step takes milliseconds and there are
-            several cores.
+        parallel: whether each environment gets a process, which pays if a step takes milliseconds and there
+            are several cores.
         termination: rule that ends an episode at its goal, see :class:`GymGoalEnv`.
-        achieved_reward: the reward from which on a goal counts as achieved, for dense rewards; if None, the
+        achieved_reward: the least reward at which a goal counts as achieved, for dense rewards; if None, the
             least reward at which the environment's method ``_is_success`` is true.
         info_keys: keys of ``info`` that ``compute_reward`` reads, see :class:`GymGoalEnv`.
         observation_key, achieved_goal_key, desired_goal_key: the environment's names of these entries. The
-            entries in a list are joined in their order; ``compute_reward`` gets dictionaries of them.
-        pictures: whether to make it with ``render_mode="rgb_array"``, if it has that mode.
-        options: for the environment, as ``gymnasium.make`` takes them (``render_mode``, for instance).
+            entries of a list are joined in order; ``compute_reward`` gets them as a dictionary.
+        pictures: whether to make environments with ``render_mode="rgb_array"``, if they have that mode.
+        options: options of the environment, which ``gymnasium.make`` takes, such as ``render_mode``.
 
     Raises:
         ValueError: there is no such environment, it does not take an option, it lacks something that GoalEnv
@@ -160,9 +160,8 @@ class GymGoalEnv(GoalEnv, GymWrapper):
     environment's ``info`` has it. Each environment gets its actions in the shape and type of its space,
     rounded if these are whole numbers.
     The environments are independent: environment k with a given seed does the same in every batch.
-    Observations and goals that are dictionaries become vectors, in the order that
-    ``torchrl_her_envs.gym.layout.Layout`` tells; the environment's own functions get goals in their
-    original form.
+    Observations and goals that are dictionaries become vectors, in the order of
+    ``torchrl_her_envs.gym.layout.Layout``; the environment's own functions get goals in their original form.
 
     The environment's ``compute_terminated`` decides whether a goal ends an episode. If it has none,
     ``termination`` decides:
@@ -171,9 +170,9 @@ class GymGoalEnv(GoalEnv, GymWrapper):
       an achieved goal, since they have no ``info``.
     - ``"reward"``: a real or virtual goal whose reward is that of an achieved goal.
     - ``"never"``: no goal. An episode that the environment ends at its goal is ``truncated``.
-    - ``"auto"``: found by 100 steps of random actions. If the environment ended where a goal was achieved,
-      ``"success"``, or ``"reward"`` if it has no ``is_success``; if it continued, or if no goal was
-      achieved, ``"never"``. The choice is logged.
+    - ``"auto"``: chosen after 100 steps of random actions. ``"success"`` (or ``"reward"`` without
+      ``is_success``) if the environment ended an episode at an achieved goal; ``"never"`` if it continued
+      there, or if no goal was achieved. The choice is logged.
     - ``"watch"``: the environment ends episodes as it does by itself, and ``goal_ends`` counts the episodes
       that it ended or continued at their goals.
 
@@ -191,17 +190,17 @@ class GymGoalEnv(GoalEnv, GymWrapper):
         reference_env: another environment of the same kind, whose functions give the rewards of goals.
         seed: seed of all environments; R seeds for R equal blocks of them, each as if alone.
         termination: rule that ends an episode at its goal.
-        achieved_reward: the reward from which on a goal counts as achieved; the reward of equal goals if
+        achieved_reward: the least reward at which a goal counts as achieved; the reward of equal goals if
             None.
         info_keys: keys of ``info`` that its functions read. The info of every step must have them, as numbers
             or arrays of numbers.
 
     Attributes:
-        goal_ends: what ends an episode at its goal, and what the environment was seen to do there.
+        goal_ends: rule for the ends of episodes at goals, and counts of what the environment did there.
         achieved_reward: the least reward of an achieved goal.
         missed_reward: the least reward that was seen when the environment was tried; a sparse reward is
             always one of these two.
-        dense_reward: whether there are many other rewards.
+        dense_reward: whether missed goals have many different rewards.
 
     Raises:
         ValueError: environments cannot be shared out among the seeds, an achieved goal gives no more
@@ -223,7 +222,7 @@ class GymGoalEnv(GoalEnv, GymWrapper):
         shown = shown_of(reference_env.observation_space)
         id = spec_of(reference_env).id
         self._layouts = {key: Layout(shown[key], f"{id}: {key}") for key in KEYS}
-        super().__init__(envs, device="cpu", **kwargs)  # TorchRL's metaclass adds some
+        super().__init__(envs, device="cpu", **kwargs)  # TorchRL's metaclass adds arguments
         self._reference_env = reference_env
         self.max_steps = spec_of(reference_env).max_episode_steps or 0
         self._try_out(check_termination(termination), achieved_reward, info_keys)
@@ -232,7 +231,7 @@ class GymGoalEnv(GoalEnv, GymWrapper):
     def _try_out(
         self, termination: Termination, achieved_reward: float | None, info_keys: Sequence[str]
     ) -> None:
-        """Finds out how the environment rewards and ends, with a few of its own goals and steps."""
+        """Finds the environment's rules for rewards and ends by trying some of its goals and steps."""
         env, layout, id = self._reference_env, self._layouts["achieved_goal"], spec_of(self._reference_env).id
         seen = try_steps(env, layout).infos if len(info_keys) > 0 else []
         self._infos = infos = Infos(info_keys, seen, id)
@@ -262,7 +261,7 @@ class GymGoalEnv(GoalEnv, GymWrapper):
         )
         computed = self._reward_of(trial.achieved, trial.desired, stepped)
         met = computed >= self.achieved_reward
-        went_on = ~trial.terminated | met  # virtual goals keep the cost of failures
+        went_on = ~trial.terminated | met  # without failures, whose cost virtual goals keep
         warn_once(
             self._reward_of.hint(info) or check_same_rewards(id, trial.reward[went_on], computed[went_on])
         )
@@ -296,7 +295,7 @@ class GymGoalEnv(GoalEnv, GymWrapper):
     def _function(
         self, name: str, goals: tuple[np.ndarray, np.ndarray], info: dict[str, np.ndarray]
     ) -> GoalFunction:
-        """Returns a function of the environment, for goals [B, g] that it gets in their original form."""
+        """Wraps a function of the environment for goals [B, g], which it gets in their original form."""
         method, layout = self._reference_env.get_wrapper_attr(name), self._layouts["achieved_goal"]
 
         def function(achieved: np.ndarray, desired: np.ndarray, info: Any) -> Any:
@@ -318,10 +317,10 @@ class GymGoalEnv(GoalEnv, GymWrapper):
         return fetch_stages(spec_of(self._reference_env).id) or super().stages()
 
     def state_names(self) -> dict[str, list[int]]:
-        """Names for entries of the state: ``observation``, ``desired_goal``, and entries nested in them.
+        """Returns names for entries of the state: ``observation``, ``desired_goal`` and their nested entries.
 
         Nested entries are named with dots between the keys, as in ``observation.arm.angles``. The Fetch tasks
-        have names for more, such as ``object``.
+        have further names, such as ``object``.
         """
         names, first = super().state_names() | fetch_names(spec_of(self._reference_env).id), 0
         for key in ("observation", "desired_goal"):
@@ -341,7 +340,7 @@ class GymGoalEnv(GoalEnv, GymWrapper):
             info: [...], with the entries ``info_keys`` if there are any, broadcast against the goals.
 
         Returns:
-            [..., 1] of float32.
+            Rewards, float32 [..., 1].
 
         Raises:
             ValueError: there are ``info_keys``, and no info is given.
@@ -378,7 +377,7 @@ class GymGoalEnv(GoalEnv, GymWrapper):
             raise ValueError(f'pictures need render_mode="rgb_array", got {mode!r}')
         try:
             drawn = self._drawn(worlds)
-        except Exception as error:  # whatever a renderer raises
+        except Exception as error:  # a renderer may raise any error
             raise ValueError(cannot_draw(self.task_name, error)) from error
         return [as_picture(picture, self.task_name, size=size) for picture in drawn]
 
@@ -400,7 +399,7 @@ class GymGoalEnv(GoalEnv, GymWrapper):
         desired_goal: Tensor,
         info: TensorDictBase | None,
     ) -> Tensor:
-        """Returns a function's answers [..., 1]."""
+        """Calls a function for pairs of goals [..., g], and returns its results [..., 1]."""
         if info is None and self.info_keys:
             raise ValueError(needs_info(self))
         pair = torch.broadcast_tensors(achieved_goal, desired_goal)
@@ -410,7 +409,7 @@ class GymGoalEnv(GoalEnv, GymWrapper):
         return answers.to(pair[0].device).view(*pair[0].shape[:-1], 1)
 
     def _rows(self, goals: Tensor) -> np.ndarray:
-        """Goals [..., g] as rows."""
+        """Converts goals [..., g] to an array of rows."""
         return goals.detach().cpu().reshape(-1, goals.shape[-1]).numpy()
 
     # TorchRL's hooks
@@ -427,7 +426,7 @@ class GymGoalEnv(GoalEnv, GymWrapper):
         self.done_spec = self._make_done_spec()
 
     def read_action(self, action: Tensor) -> np.ndarray:
-        """Actions as the environments take them, in the shape, bounds and type of their space."""
+        """Converts actions to the shape, bounds and dtype of the environments' action space."""
         space, rows = self._env.single_action_space, super().read_action(action)
         if isinstance(space, spaces.Discrete):
             return rows + space.start
@@ -440,7 +439,7 @@ class GymGoalEnv(GoalEnv, GymWrapper):
         return torch.as_tensor(space.low).flatten(), torch.as_tensor(space.high).flatten()
 
     def read_obs(self, observations: dict[str, Any]) -> dict[str, Any]:
-        """Observation and goals in float32, and ``is_success``; further keys are left out."""
+        """Returns observation and goals in float32, and ``is_success``; leaves out further keys."""
         shown = {key: self._layouts[key].flatten(observations[key]) for key in KEYS}
         if SUCCESS in self.observation_spec:
             word = observations.get(SUCCESS, np.zeros(self.batch_size))
@@ -449,7 +448,7 @@ class GymGoalEnv(GoalEnv, GymWrapper):
         return {**super().read_obs(shown), **info}
 
     def _output_transform(self, step_outputs_tuple: tuple[Any, ...]) -> Any:
-        """Returns the outputs of a step, with the ends of episodes that goals give."""
+        """Returns the outputs of a step, with ends of episodes by the rule for goals."""
         shown, reward, terminated, truncated, info = step_outputs_tuple
         if SUCCESS in info:
             shown = {**shown, SUCCESS: info[SUCCESS]}
@@ -460,7 +459,7 @@ class GymGoalEnv(GoalEnv, GymWrapper):
         return super()._output_transform((shown, reward, terminated, truncated, info))
 
     def _met(self, shown: dict[str, Any]) -> np.ndarray:
-        """Returns which environments achieve their goals, [N] of bool, by ``is_success`` or the reward."""
+        """Returns a mask [N] of environments that achieve their goals, by ``is_success`` or the reward."""
         if self.goal_ends.asks_success:
             return np.asarray(shown.get(SUCCESS, np.zeros(self.batch_size))).astype(np.bool_)
         achieved, desired = (self._layouts[key].flatten(shown[key]) for key in KEYS[1:])

@@ -23,7 +23,7 @@ class _OneInfo(dict[str, Any]):
 
     def __contains__(self, key: object) -> bool:
         present = super().__contains__(key)
-        if not present and isinstance(key, str):  # and no row of a batch
+        if not present and isinstance(key, str):  # not the index of a row
             self._lacking.add(key)
         return present
 
@@ -46,7 +46,7 @@ class GoalFunction:
     dictionaries.
 
     Args:
-        function: (achieved goal, desired goal, info) to a number or truth value.
+        function: maps (achieved goal, desired goal, info) to a number or bool.
         achieved: [M, g] goals to try it with. Some rows should be equal to those of ``desired`` and others
             not, and M should not be g, so that the two dimensions cannot be mistaken for each other.
         desired: [M, g].
@@ -56,17 +56,17 @@ class GoalFunction:
     Attributes:
         form: form in which the function takes one pair of goals: the two goals (``"pair"``), a batch of one
             (``"rows"``), or a batch of one with an array of infos.
-        answers: ``"batch"`` if it takes batches, ``"one"`` if one value answers for all, ``"loop"`` if it
+        answers: ``"batch"`` if it takes batches, ``"one"`` if one value holds for all pairs, ``"loop"`` if it
             has to be called pair by pair.
         tried: [M], the function's results for the goals that it was tried with.
         lacking: keys of infos that the function read but that were missing.
 
     Raises:
-        ValueError: it cannot be called with such infos, or does not answer with one number.
+        ValueError: the function cannot be called with such infos, or does not return one number.
 
     Example:
         >>> here, there = np.array([[0.0, 0.0], [3.0, 4.0], [1.0, 1.0]]), np.array([[0.0, 0.0]] * 3)
-        >>> near = lambda a, d, info: bool(np.linalg.norm(a - d) < 1)  # the norm of all of a batch
+        >>> near = lambda a, d, info: bool(np.linalg.norm(a - d) < 1)  # the norm of a whole batch
         >>> function = GoalFunction(near, here, there, name="compute_terminated")
         >>> function.answers, function(here, there).tolist()
         ('loop', [1.0, 0.0, 0.0])
@@ -144,7 +144,7 @@ class GoalFunction:
         return answer.item()
 
     def hint(self, info: Collection[str]) -> str:
-        """Returns a hint about entries of infos that the function reads besides the named keys."""
+        """Returns a hint about missing entries of infos that the function reads; empty if there are none."""
         if not self.lacking:
             return ""
         keys = sorted(self.lacking)

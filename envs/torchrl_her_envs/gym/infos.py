@@ -18,7 +18,7 @@ class Infos:
 
     Args:
         names: names of the entries.
-        seen: the infos of some steps, each of which must have all of them.
+        examples: the infos of some steps, each of which must have all these entries.
         env: name of the environment, for messages.
 
     Raises:
@@ -77,7 +77,7 @@ class Infos:
         return {name: np.array([info[name] for info in infos], kind[1]) for name, kind in self._kinds.items()}
 
     def of_batch(self, infos: Mapping[str, Any], count: int, *, reset: bool = False) -> dict[str, np.ndarray]:
-        """Returns the entries [count, ...] of a vector environment's info; 0 where a reset gives none.
+        """Returns the entries [count, ...] of a vector environment's info; 0 where a reset lacks one.
 
         Raises:
             ValueError: an environment's step lacks an entry.

@@ -1,4 +1,4 @@
-"""Order of observations, goals and actions in a row of numbers, nested dictionaries included."""
+"""Converts observations, goals and actions, nested dictionaries included, to rows of numbers and back."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Layout:
     agree.
 
     Args:
-        space: an array, a whole number, or a dictionary of these and further dictionaries.
+        space: space of an array, a whole number, or a dictionary of these and further dictionaries.
         name: name of the space, for messages.
 
     Raises:
@@ -82,7 +82,7 @@ class Layout:
         return [(leaf.path, leaf.shape) for leaf in self._leaves]
 
     def flatten(self, values: Any) -> np.ndarray:
-        """Flattens values of the space, with the same leading dimensions [...], to rows [..., width].
+        """Flattens values of the space with leading dimensions [...] to rows [..., width].
 
         Raises:
             ValueError: a value is not a finite number of float32; the message names it.

@@ -1,4 +1,4 @@
-"""Makes environments of gymnasium's without the lines that their simulators print."""
+"""Makes gymnasium environments without the lines that their simulators print."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def make_quietly(
     Args:
         id: id of the environment.
         names: names of its entries, see :class:`~torchrl_her_envs.gym.renamed.RenamedKeys`; None for
-            GoalEnv's.
+            GoalEnv's own names.
         options: options of the environment.
     """
     with _python_alone():

@@ -1,4 +1,4 @@
-"""Registers the tasks with gymnasium, under ids."""
+"""Registers the throwing and reaching tasks with gymnasium."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def gym_id(task: Task) -> str:
 
 
 def register_gym_ids() -> None:
-    """Registers all tasks with gymnasium, for ``make`` and ``make_vec``; importing this package does it."""
+    """Registers all tasks with gymnasium, for ``make`` and ``make_vec``; importing this package calls it."""
     for name, task in TASKS.items():
         if gym_id(task) not in gymnasium.registry:
             gymnasium.register(

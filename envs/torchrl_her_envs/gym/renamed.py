@@ -21,7 +21,7 @@ class RenamedKeys(gymnasium.ObservationWrapper):
 
     Args:
         env: environment whose observations are a dictionary.
-        names: the environment's entry, or entries, for each of the three.
+        names: the environment's entry, or entries, for each of the three keys.
 
     Raises:
         ValueError: the environment has no such entry.

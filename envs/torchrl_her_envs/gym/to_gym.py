@@ -20,11 +20,11 @@ Observation = dict[str, Any]  # arrays
 KEYS = ("observation", "achieved_goal", "desired_goal")
 FPS = 25
 _FIRST = np.zeros(1, np.int64)  # the index of the only environment
-_NO_LIMIT = 1 << 60  # steps: gymnasium's TimeLimit truncates
+_NO_LIMIT = 1 << 60  # steps; gymnasium's TimeLimit truncates episodes instead
 
 
 class GoalRules:
-    """The functions of goals that gymnasium's GoalEnv requires, for one pair of goals or many."""
+    """Functions of goals that gymnasium's GoalEnv requires, for one pair of goals or many."""
 
     _core: ThrowingCore
 
@@ -37,18 +37,18 @@ class GoalRules:
             info: not used.
 
         Returns:
-            [...] of float: 0 where both goals are nearer than the task's threshold, -1 elsewhere.
+            Rewards [...]: 0 where the goals' distance is below the task's threshold, -1 elsewhere.
         """
         achieved_goal = np.asarray(achieved_goal)
         rewards = reward_of(self._achieved(achieved_goal, desired_goal))
         return rewards.astype(np.result_type(achieved_goal, np.float16))[()]
 
     def compute_terminated(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any) -> Any:
-        """Returns whether the goal is achieved, which ends an episode: [...] of bool."""
+        """Returns whether goals are achieved, which ends an episode, as bool [...]."""
         return self._achieved(achieved_goal, desired_goal)[()]
 
     def compute_truncated(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any) -> Any:
-        """Returns False for all goals, [...] of bool: only the time limit truncates episodes."""
+        """Returns False [...] for all pairs of goals: only the time limit truncates episodes."""
         shape = np.broadcast_shapes(np.shape(achieved_goal), np.shape(desired_goal))
         return np.zeros(shape[:-1], np.bool_)[()]
 
@@ -61,7 +61,7 @@ class GymTask(GoalRules, gymnasium.Env[Observation, np.ndarray]):
 
     Observations are a dict of ``observation``, ``achieved_goal`` and ``desired_goal`` (float32), actions
     are in [-1, 1], the reward is 0 where the goal is achieved and -1 elsewhere: see
-    :class:`~torchrl_her_envs.ThrowingEnv`. ``info["is_success"]`` tells whether the goal is achieved,
+    :class:`~torchrl_her_envs.ThrowingEnv`. ``info["is_success"]`` is whether the goal is achieved,
     which also ends the episode. The time limit is the one that ``gymnasium.make`` adds.
 
     Args:
@@ -151,7 +151,7 @@ class GymTask(GoalRules, gymnasium.Env[Observation, np.ndarray]):
         (state,) = self._core.show_state()  # a new array, which no other object shares
         return {
             "observation": state[:-2],
-            "achieved_goal": state[self._core.achieved_index].copy(),  # the grip is in the observation, too
+            "achieved_goal": state[self._core.achieved_index].copy(),  # the observation has this memory, too
             "desired_goal": state[-2:],
         }
 

@@ -1,4 +1,4 @@
-"""Many environments of a task as a vector environment of gymnasium's."""
+"""Many environments of a task as a gymnasium vector environment."""
 
 from __future__ import annotations
 
@@ -92,8 +92,8 @@ class GymVectorTask(GoalRules, VectorEnv[Observation, np.ndarray, np.ndarray]):
         """Begins episodes.
 
         Args:
-            seed: seed of the first environment (each further one has one more), or one for each environment,
-                where None draws one.
+            seed: seed s of the first environment, with s + 1 for the second and so on; or a list of a seed or
+                None for each environment, where None draws a seed.
             options: ``{"reset_mask": [N] of bool}`` resets those environments alone.
 
         Raises:

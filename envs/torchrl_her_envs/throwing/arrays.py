@@ -18,7 +18,7 @@ _OF_NUMBERS = SimpleNamespace(cos=math.cos, sin=math.sin, __name__="numbers")
 def functions_of(values: Any) -> Any:
     """Returns the module of functions for values: ``numpy``, ``torch``, or some of ``math``'s for a number.
 
-    Use only functions that all have by one name, with positional arguments.
+    Use only functions that all three have under one name, with positional arguments.
 
     Example:
         >>> [functions_of(value).__name__ for value in (np.zeros(2), torch.zeros(2), 0.5)]
@@ -30,7 +30,7 @@ def functions_of(values: Any) -> Any:
 
 
 def like(constant: np.ndarray, values: Array) -> Array:
-    """Converts a constant to an array, or to a tensor with the type and device of another one.
+    """Converts a constant to the form of ``values``: an array, or a tensor of the same dtype and device.
 
     Example:
         >>> like(np.array([0.5]), torch.zeros(2)).dtype

@@ -162,7 +162,7 @@ class ThrowingCore:
         self._rows = rows
         self._body_rows = [rows[name] for name in _BODIES]
         self._bodies = [self._matrix[body_rows] for body_rows in self._body_rows]
-        self._bodies_of = itemgetter(*self._body_rows)  # ... of a column, as a list
+        self._bodies_of = itemgetter(*self._body_rows)  # takes the bodies' rows from a column (a list)
         self._joints, self._joint_velocity, self._grip, self._grip_velocity, *balls = self._bodies
         self._ball, self._ball_velocity = balls
         self._angles = [self._matrix[rows[name]] for name in ("cosines", "sines") if name in rows]
@@ -220,7 +220,7 @@ class ThrowingCore:
 
         Args:
             action: [N, J + 1] of floating-point numbers: speeds of the joints, then the grip, which closes
-                above 0. Beyond 1 they count as 1.
+                above 0. Numbers are clamped to [-1, 1].
 
         Raises:
             ValueError: actions of another shape, or that are not finite; nothing has moved then.
@@ -284,15 +284,15 @@ class ThrowingCore:
         return state.T.astype(self.dtype, order="C")
 
     def achieved(self, achieved_goal: np.ndarray, desired_goal: np.ndarray) -> np.ndarray:
-        """Returns where observed goals [..., 2] are nearer to each other than the threshold: [...]."""
+        """Returns a mask [...] of pairs of observed goals [..., 2] that are nearer than the threshold."""
         dx, dy = (achieved_goal - desired_goal).T
         return within(dx, dy, self.threshold).T
 
     def out_of_time(self) -> np.ndarray:
-        """Returns whether each episode has had its last step: [N] of bool."""
+        """Returns whether each episode has had its last step, as bool [N]."""
         return self._step >= self.world.max_steps
 
-    # Parts that are made once
+    # Constants of the task
 
     def _fastest_throw(self) -> float:
         """Returns a bound on the speed of the grip, in meters a second."""

@@ -13,7 +13,7 @@ class Effector(Protocol):
     The functions take NumPy arrays or tensors and return the same type. ``move_one`` and ``grip_one`` take
     the joints of a single world as plain numbers, which is several times as fast as arrays of one.
 
-    ``num_joints`` is the number of joints, ``action_speed`` the speed that an action of 1 asks for,
+    ``num_joints`` is the number of joints, ``action_speed`` the speed at an action of 1,
     ``reach`` the box around what the grip can reach: left, bottom, right and top, in fractions of the
     screen. ``shown`` names the quantities that the agent observes, in that order: ``cosines`` and ``sines``
     (of all joints), ``grip``, ``joint_velocity``, ``grip_velocity``, ``closed``. ``observation_size`` is the

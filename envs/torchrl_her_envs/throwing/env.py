@@ -136,7 +136,7 @@ class ThrowingEnv(BatchedEnv):
         return True
 
     def compute_terminated(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
-        """Returns whether goals [..., 2] are nearer to each other than the threshold: [..., 1] of bool."""
+        """Returns whether pairs of goals [..., 2] are nearer than the threshold, as bool [..., 1]."""
         (x, y), (other_x, other_y) = achieved_goal.unbind(-1), desired_goal.unbind(-1)
         return within(x - other_x, y - other_y, self.threshold).unsqueeze(-1)
 
@@ -149,7 +149,7 @@ class ThrowingEnv(BatchedEnv):
         to them.
 
         Raises:
-            ValueError: the task has no throw, and reaching has no stages.
+            ValueError: the task is a reaching task, which has no stages.
         """
         if not self.task.throws:
             raise ValueError(f"{self.task_name} has no curriculum: it has one stage; choose a throwing task")

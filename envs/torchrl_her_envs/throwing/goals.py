@@ -16,7 +16,7 @@ from torchrl_her_envs.throwing.arrays import Array, functions_of
 class GoalDistribution(Protocol):
     """A distribution of points with a bounding box, all in one coordinate system.
 
-    ``low`` and ``high`` are the corners of the (smallest) box around it, ``is_box`` tells whether
+    ``low`` and ``high`` are the corners of the (smallest) box around it, ``is_box`` is whether
     the distribution is uniform over that box, ``from_uniform`` maps [..., 2] numbers in [0, 1) to
     points (an array to an array, a tensor to a tensor), ``sample`` draws [n, 2] points, and ``scaled`` is
     the same distribution in coordinates ``factor * x + shift``.
@@ -43,11 +43,11 @@ class _Sampled:
 
 
 class BoxGoals(_Sampled):
-    """Uniform over an axis-aligned box.
+    """Uniform distribution over an axis-aligned box.
 
     Args:
-        low: left and bottom.
-        high: right and top; equal to ``low`` in a direction that has no extent.
+        low: left and bottom coordinate.
+        high: right and top coordinate; equal to ``low`` in a direction without extent.
 
     Raises:
         ValueError: ``high`` is below ``low``.
@@ -76,12 +76,12 @@ class BoxGoals(_Sampled):
 
 
 class SectorGoals(_Sampled):
-    """Angle and radius each uniform over a range, around a center (the robot's ball).
+    """Distribution of points around a center, with uniform angle and radius (starts of the robot's ball).
 
     Args:
-        center: the point that angles are seen from.
+        center: the point from which angle and radius are measured.
         angle: range in degrees, counter-clockwise from the x axis.
-        radius: range.
+        radius: range of distances from the center.
     """
 
     is_box = False
@@ -115,5 +115,5 @@ class SectorGoals(_Sampled):
 
 
 def _beside(u: Array, constant: Tensor) -> Array:
-    """Converts a constant of float64 to an array if it is to be combined with one."""
+    """Returns a float64 constant as an array if ``u`` is one, else as a tensor."""
     return constant.numpy() if isinstance(u, np.ndarray) else constant

@@ -70,7 +70,7 @@ class BallPhysics:
         Args:
             position: [num_worlds, 2] float64, meters within the world.
             velocity: [num_worlds, 2] float64, meters a second.
-            free: [num_worlds] of bool, which balls move; None for all.
+            free: [num_worlds], mask of the balls that move; None for all.
 
         Returns:
             The new positions and velocities; those of all other balls are unchanged.
@@ -85,7 +85,7 @@ class BallPhysics:
 
         Args:
             balls: [4, num_worlds] float64: x, y and their velocities, in meters within the world.
-            free: [num_worlds] of bool, which balls move.
+            free: [num_worlds], mask of the balls that move.
         """
         # A step depends on nothing but the state: if it left a ball unchanged once, it will do so again.
         moves = np.logical_or.reduce(balls != self._settled, 0)
@@ -129,8 +129,8 @@ class BallPhysics:
             to_x = to_x + across
             to_y = to_y + falls * self._substep
             falls = falls - self._pull
-        # Contacts are looked for at the end of each substep. Without gravity the ball would come to here;
-        # its true way lies between that line and the one to its end.
+        # Contacts are looked for at the end of each substep. Without gravity the ball would come to
+        # ``straight``; its path lies between the lines to there and to its true end.
         straight = y + speed_y * self._step
         low, high = (to_y, straight) if self._pull >= 0 else (straight, to_y)
         return to_x, to_y, speed_x, falls, self._limits.reached((x, to_x), (y, low), (y, high))
@@ -148,7 +148,7 @@ class BallPhysics:
 
 
 class _Limits:
-    """Coordinates beyond which, or around the wall, a ball may touch something."""
+    """Coordinates beyond which a ball may touch a side of the screen or the wall."""
 
     def __init__(self, world: WorldConfig, *, wall: bool) -> None:
         reach = world.ball_radius * world.size + 2 * _SKIN  # one skin more than needed, against rounding
@@ -162,9 +162,9 @@ class _Limits:
         """Returns whether a ball within a box, in numbers or arrays, may touch something.
 
         Args:
-            xs: its left and right sides, in any order.
-            lows: two heights, the lower of which is its bottom.
-            highs: two heights, the higher of which is its top.
+            xs: left and right side of the box, in any order.
+            lows: two heights, the lower of which is the bottom of the box.
+            highs: two heights, the higher of which is the top of the box.
         """
         (x, to_x), (y, low), (_, high) = xs, lows, highs
         least, most = self._least, self._most
@@ -178,7 +178,7 @@ class _Limits:
 
 
 class _Space:
-    """Chipmunk space with the sides and the wall of one world, and balls for all that move at once.
+    """Chipmunk space with the sides and the wall of one world, and one ball for each that moves in a step.
 
     Args:
         world: the constants of the world.
@@ -205,7 +205,7 @@ class _Space:
         self._make_room(count)
         space, state = self._space, self._state
         pymunk.batch.set_space_bodies(space, _FIELDS, self._parked_buffer)
-        space.step(substep)  # forgets the step before, see _resize
+        space.step(substep)  # drops contacts of the step before, see _resize
         state[:count] = before.T
         state[count:] = self._parked[count:]
         pymunk.batch.set_space_bodies(space, _FIELDS, self._buffer)
@@ -243,7 +243,7 @@ class _Space:
             ball.filter = pymunk.ShapeFilter(group=1)  # balls of different worlds do not collide
             self._space.add(body, ball)
             self._balls.append((body, ball))
-        # pymunk lists the space's static body behind the balls: the last row is that one's, and stays 0
+        # pymunk lists the space's static body behind the balls: the last row is for that body, and stays 0
         self._parked = np.zeros((count + 1, 4))
         # Beyond the right side, which is 2 * _BORDER thick whatever the size of the world.
         diameter = 2 * world.ball_radius * world.size

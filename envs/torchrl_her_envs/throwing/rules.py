@@ -61,10 +61,10 @@ def take_step(now: Bodies, action: Any, closed: Any, kind: Kind, *, catch: float
     """Opens or closes the grips, moves them, lets the free balls fly, and catches.
 
     Args:
-        now: before the step.
+        now: the bodies before the step.
         action: the speeds of the joints, within [-1, 1]: [J, N], or a list.
         closed: whether the grips close: [N] of bool, or a bool.
-        kind: numbers or arrays.
+        kind: the operations on numbers or on arrays.
         catch: distance from a closed grip within which a ball is caught, in meters.
     """
     held, released = now.held & closed, now.held > closed
@@ -130,7 +130,7 @@ class Numbers:
 
 
 class Arrays:
-    """Moves, velocities and choices for all worlds at once, as operations on arrays."""
+    """Operations on all worlds at once, in arrays."""
 
     def __init__(self, effector: Effector, physics: BallPhysics, world: WorldConfig) -> None:
         self._effector, self._physics = effector, physics

@@ -11,7 +11,7 @@ from torch import Tensor
 class WorldState:
     """The state of N environments in meters, radians and seconds. Every tensor has N rows.
 
-    ``free`` says that the ball obeys physics: not while it is held, and in the robot's tasks not before it
+    ``free`` is whether the ball obeys physics: not while it is held, and in the robot's tasks not before it
     was held for the first time. ``step`` counts the steps of the episode, ``episode`` the resets. The tensors
     share memory with the arrays that steps write to, so writing to them changes the environments.
     """

@@ -47,7 +47,7 @@ class WorldConfig:
     """
 
     size: float = 6.0  # side of the square screen
-    pixels: int = 900  # ... and in pixels, which the thesis gives lengths in
+    pixels: int = 900  # the same side in pixels, the thesis's unit of length
     gravity: float = 10.0  # thesis, appendix A
     bounce: float = 0.7  # share of the normal speed that a bounce keeps: thesis, appendix A
     friction: float = 0.1  # kinetic: thesis, appendix A
@@ -55,9 +55,9 @@ class WorldConfig:
     time_step: float = 0.04  # 25 actions a second
     substeps: int = 4  # the fastest ball, 15.7 m/s, moves 0.157 m in each: see check_wall
     max_steps: int = 50  # an episode is 2 s
-    hand_speed: float = 8.0  # at most, in each direction: enough to throw across the screen
-    joint_speed: float = 4.0  # rad/s, at most
-    ball_radius: float = 0.03  # screen; also the distance at which a hand catches or has reached it
+    hand_speed: float = 8.0  # greatest speed in each direction: enough to throw across the screen
+    joint_speed: float = 4.0  # greatest speed, rad/s
+    ball_radius: float = 0.03  # screen; also the distance below which a hand catches or reaches the ball
     hole_radius: float = 0.05  # screen; distance at which a ball is at the goal
     hand_goals: tuple[float, float, float, float] = (0.55, 0.2, 0.95, 0.8)  # screen: left, bottom, right, top
     arm_goals: tuple[float, float, float, float] = (0.72, 0.2, 0.95, 0.8)  # beyond the arm's reach
@@ -88,7 +88,7 @@ class WorldConfig:
             object.__setattr__(self, name, int(value))  # 4.0, as from a file, counts as 4
 
     def fastest_ball(self, thrown: float) -> float:
-        """Upper bound on the speed of a ball, in meters a second.
+        """Returns an upper bound on the speed of a ball, in meters a second.
 
         A bounce gives no energy to a ball, so only the throw and a fall across the whole screen make it
         faster.
@@ -151,7 +151,7 @@ class Task:
         effector: ``"hand"`` (moves freely in the left half) or ``"arm"``.
         start: the ball is ``"held"`` from the first step, ``"away"`` (on the floor, or in the air
             for the arm), or ``"mixed"``: held in half of the episodes.
-        throws: the goal is a black hole for the ball; otherwise it is the ball, for the effector.
+        throws: whether the ball must reach a black hole; otherwise the effector must reach the ball.
         wall: whether a wall stands in the middle.
         goal_sigma: distance within which other goals help to learn a goal, as a share of the screen: the
             final sigma of IBS.

@@ -18,7 +18,7 @@ from torchrl_her_envs.common.seeding import as_seeds, uniform
 from torchrl_her_envs.toy.goals import LatticeGoals
 from torchrl_her_envs.toy.pictures import WIDTH, Sheet, draw
 
-MOST_STEPS = (1 << 20) - 1  # steps of an episode that random numbers are set aside for
+MOST_STEPS = (1 << 20) - 1  # most steps of an episode: random numbers are reserved for them
 
 
 @dataclass
@@ -70,7 +70,7 @@ class ToyEnv(BatchedEnv):
         ValueError: a number out of its range, or environments that cannot be shared out among the seeds.
     """
 
-    name: ClassVar[str]  # of the task
+    name: ClassVar[str]  # name of the task
 
     def __init__(
         self,
@@ -119,7 +119,7 @@ class ToyEnv(BatchedEnv):
         """Returns whether achieved and desired goals [..., g] are equal, as bool [..., 1].
 
         Raises:
-            ValueError: goals of another width than g.
+            ValueError: goals do not have width g.
         """
         size = len(self._goals.low)
         for goal in (achieved_goal, desired_goal):
@@ -169,7 +169,7 @@ class ToyEnv(BatchedEnv):
         return (self.worlds.place == self.worlds.goal).all(-1, keepdim=True)
 
     def _uniform(self, which: Tensor, count: int) -> Tensor:
-        """Random numbers [M, count] for the given environments at their present step."""
+        """Returns random numbers [M, count] for the given environments at their present step."""
         w = self.worlds
         moment = w.episode[which] * (MOST_STEPS + 1) + w.step[which]
         return uniform(self._keys[which.numpy()], moment, count)
@@ -197,7 +197,7 @@ class ToyEnv(BatchedEnv):
         }
 
     def _scale(self, place: Tensor) -> Tensor:
-        """Places as the agent sees them; computed in float64, like the goals that are sampled."""
+        """Converts places to the agent's coordinates, in float64 as for the goals that are sampled."""
         steps = place.to(torch.float64)
         return (self._low + steps * (self._high - self._low) / self._last).to(torch.float32)
 

@@ -21,9 +21,9 @@ class Chain(ToyEnv):
     probability p (premise 1). If action 1 fails, and always with action 0, the agent goes back: by one place,
     or to the first place in the reset-state form. At the first place it stays.
 
-    Always taking action 1 therefore arrives in one of ``p ** -n`` episodes. With p = 1 an untrained
-    policy that goes forward with probability q arrives in one of ``q ** -n``; hindsight lets it
-    learn place by place instead.
+    Always taking action 1 therefore reaches the goal in one of ``p ** -n`` episodes. With p = 1 an
+    untrained policy that goes forward with probability q reaches it in one of ``q ** -n``; with hindsight,
+    the policy learns place by place instead.
 
     The agent sees n links. At place k the first k are closed (1) and the others open (-1); the goal is
     that all are closed. With ``stages`` above 1 the chain consists of equal parts, and only the links of

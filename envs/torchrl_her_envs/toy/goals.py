@@ -9,7 +9,7 @@ from torch import Tensor
 
 
 class LatticeGoals:
-    """Uniform over the points of a regular lattice: a :class:`~torchrl_her_envs.GoalDistribution`.
+    """Uniform distribution over points of a regular lattice; a :class:`~torchrl_her_envs.GoalDistribution`.
 
     Args:
         low: [g], the least coordinates.
@@ -39,7 +39,7 @@ class LatticeGoals:
 
     def from_uniform(self, u: Tensor) -> Tensor:
         """Maps [..., g] numbers in [0, 1) to points of the lattice."""
-        steps = (u * self.count).floor().clamp(max=self.count - 1)  # float32 rounds up to the count
+        steps = (u * self.count).floor().clamp(max=self.count - 1)  # float32 may round up to count
         return self.low + steps * (self.high - self.low) / max(self.count - 1, 1)
 
     def sample(self, n: int, *, generator: torch.Generator | None = None) -> Tensor:

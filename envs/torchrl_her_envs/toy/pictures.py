@@ -13,8 +13,8 @@ from torch import Tensor
 from torchrl_her_envs.common.rendering.colors import FAILURE, INK, MARGIN, SUCCESS, Color
 
 WIDTH = 300  # pixels of the width, by default
-_HEIGHT = 0.6  # as a fraction of the width
-_FINER = 2  # factor by which it is drawn larger, for smooth edges
+_HEIGHT = 0.6  # height of a picture, as a fraction of its width
+_FINER = 2  # factor by which pictures are drawn larger, for smooth edges
 _MOST_CELLS = 400  # links of a chain up to which they are drawn one by one
 _LIGHT: Color = (252, 251, 248)
 _HAT: Color = (58, 56, 62)

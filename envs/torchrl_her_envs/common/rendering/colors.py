@@ -6,5 +6,5 @@ Color = tuple[int, int, int] | tuple[int, int, int, int]  # red, green, blue and
 
 MARGIN: Color = (236, 233, 226)  # around pictures, and in places of a grid that have none
 INK: Color = (84, 82, 88)  # color of text
-SUCCESS: Color = (64, 168, 98)  # the border of an episode that achieved its goal ...
-FAILURE: Color = (204, 96, 92)  # ... and of one that did not
+SUCCESS: Color = (64, 168, 98)  # border of an episode that achieved its goal
+FAILURE: Color = (204, 96, 92)  # border of an episode that missed its goal

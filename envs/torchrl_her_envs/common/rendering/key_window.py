@@ -19,7 +19,7 @@ _NO_DISPLAY = (
 
 
 class Command(Enum):
-    """Request that a user makes with a key; the value is what the keys are called."""
+    """Command that a user gives by pressing a key; the value describes its keys."""
 
     PAUSE = "space: pause"
     STEP = "n or right arrow: one step"
@@ -43,7 +43,7 @@ class KeyWindow:
     def __init__(self, title: str) -> None:
         self._pygame = pygame = _import_pygame()
         if sys.platform == "linux" and not any(os.environ.get(name) for name in _DISPLAYS):
-            raise ValueError(_NO_DISPLAY.format(reason=""))  # SDL would print lines of its own
+            raise ValueError(_NO_DISPLAY.format(reason=""))  # before SDL prints messages of its own
         try:
             pygame.display.init()
             driver = pygame.display.get_driver()
@@ -82,7 +82,7 @@ class KeyWindow:
     def show(self, picture: np.ndarray) -> None:
         """Shows a picture [height, width, 3] of uint8, scaled to the window.
 
-        The first picture, and each one of other proportions, gives the window its size.
+        The window takes the size of the first picture, and of each picture whose size differs from the last.
         """
         pygame = self._pygame
         height, width, _ = picture.shape

@@ -1,4 +1,4 @@
-"""Finished pictures: size, caption, border, and many of them in one."""
+"""Functions on finished pictures: scale them, add captions and borders, join several to one."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def as_picture(drawn: Any, name: str, *, size: int | None = None) -> Tensor:
         size: length of the longer side in pixels; None keeps the size.
 
     Raises:
-        ValueError: it is something else.
+        ValueError: ``drawn`` is no such picture.
 
     Example:
         >>> as_picture(None, "walk")
@@ -73,7 +73,7 @@ def captioned(picture: Tensor, words: str) -> Tensor:
     draw = ImageDraw.Draw(image)
     height = max(6.0, _TEXT * image.height)
     font, place = ImageFont.load_default(size=height), (0.98 * image.width, 0.02 * image.height)
-    # Pictures of any environment may have any color there.
+    # A strip below the text, since the picture may have any color there.
     draw.rectangle(draw.textbbox(place, words, font=font, anchor="ra"), fill=MARGIN)
     draw.text(place, words, fill=INK, font=font, anchor="ra")
     return torch.from_numpy(np.array(image))
@@ -140,7 +140,7 @@ def tile(pictures: Sequence[Tensor], *, columns: int) -> Tensor:
         columns: pictures in a row.
 
     Returns:
-        [rows * height, columns * width, 3].
+        The grid [rows * height, columns * width, 3].
 
     Raises:
         ValueError: ``columns`` is below 1.

@@ -19,7 +19,7 @@ try:
 except ImportError:  # only MP4 needs it
     imageio = None
 
-_COLORS = 255  # colors of a GIF; one place is left for transparent pixels, which are unchanged
+_COLORS = 255  # colors of a GIF; the last of 256 is transparent, for unchanged pixels
 _SAMPLES = 12  # frames that a GIF's colors are chosen from
 
 
@@ -40,7 +40,7 @@ def write_video(frames: Sequence[Tensor], path: str | Path, *, fps: float = 25) 
 
     Raises:
         ValueError: no frames, frames of different shapes, ``fps`` not above 0, or another suffix.
-        ImportError: an MP4 without the extra.
+        ImportError: an MP4 is to be written without the extra ``video``.
 
     Example:
         >>> import tempfile

@@ -27,7 +27,7 @@ class ArmSkill:
         num_links: number of links of the arm.
 
     Raises:
-        ValueError: the arm has not two links.
+        ValueError: the arm does not have two links.
     """
 
     def __init__(self, world: WorldConfig, *, num_links: int = 2) -> None:
@@ -44,14 +44,14 @@ class ArmSkill:
         return nearest_turn(joints, target, self._base, self._world.arm_length) / self._world.time_step
 
     def throw(self, joints: Tensor, goal: Tensor, *, within: float) -> Tensor:
-        """Returns the next velocity of the joints to swing a ball at the goal, or to get ready to.
+        """Returns the next velocity of the joints to throw a ball at the goal, or to get ready for a throw.
 
-        A throw is: turn each joint at a constant speed (one of a grid) for some steps, let go, fly. The
-        quickest throw is taken; if none works from here, the arm turns to where it can throw at all goals.
-        No plan is kept, since one step later the same throw is still possible, a step shorter.
+        In a throw, each joint turns at a constant speed from a grid for some steps; then the ball is let go.
+        The quickest throw is taken; if none works from here, the arm turns to where it can throw at all
+        goals. No plan is kept, since one step later the same throw is still possible, a step shorter.
 
         Returns:
-            [B, 2] in radians a second; more than the arm's speed where it has to turn farther than one step.
+            Velocities [B, 2] in radians a second; above the arm's speed if a turn takes several steps.
 
         Example:
             >>> arm, goal = ArmSkill(WorldConfig()), torch.tensor([[5.0, 4.0]])

@@ -23,7 +23,7 @@ def fallen(substeps: Tensor, world: WorldConfig) -> Tensor:
         world: the constants of the world.
 
     Returns:
-        [...] in meters, downwards.
+        Distances [...] in meters, downwards.
 
     Example:
         >>> fallen(torch.tensor([1.0, 4.0]), WorldConfig())
@@ -37,13 +37,13 @@ def fly(start: Tensor, velocity: Tensor, substeps: Tensor, world: WorldConfig) -
     """Returns the position of a ball after some time of free flight.
 
     Args:
-        start: [..., 2].
-        velocity: [..., 2].
-        substeps: [...], broadcast against ``start[..., 0]``.
+        start: [..., 2], position at the beginning.
+        velocity: [..., 2], velocity at the beginning.
+        substeps: [...], number of substeps flown, broadcast against ``start[..., 0]``.
         world: the constants of the world.
 
     Returns:
-        [..., 2].
+        Positions [..., 2].
 
     Example:
         >>> fly(torch.tensor([1.0, 2.0]), torch.tensor([3.0, 0.0]), torch.tensor(4.0), WorldConfig())
@@ -59,12 +59,12 @@ def throw_velocity(start: Tensor, target: Tensor, steps: Tensor, world: WorldCon
 
     Args:
         start: [..., 2], where the swing of one step begins.
-        target: [..., 2], where the ball shall be ``steps`` time steps after the end of the swing.
-        steps: [...], at least 1.
+        target: [..., 2], where the ball should be ``steps`` time steps after the end of the swing.
+        steps: [...], time steps of the flight, at least 1.
         world: the constants of the world.
 
     Returns:
-        [..., 2].
+        Velocities [..., 2].
 
     Example:
         >>> world, start, goal = WorldConfig(), torch.tensor([2.0, 3.0]), torch.tensor([4.0, 2.5])
@@ -82,8 +82,8 @@ def quickest(steps: Tensor, works: Tensor) -> tuple[Tensor, ...]:
     """Selects for each row the throw that takes the fewest steps among those that hit.
 
     Args:
-        steps: [B, ...], with any dimensions that distinguish the throws of a row.
-        works: [B, ...] of bool.
+        steps: [B, ...], time steps of each throw; further dimensions distinguish the throws of a row.
+        works: [B, ...] of bool, whether each throw hits.
 
     Returns:
         The indices [B] in each further dimension; 0 where no throw works.

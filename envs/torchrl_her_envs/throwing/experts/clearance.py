@@ -19,7 +19,7 @@ def clears_ceiling(start: Tensor, velocity: Tensor, world: WorldConfig) -> Tenso
 
     Example:
         >>> start, velocity = torch.tensor([0.0, 4.9]), torch.tensor([[0.0, 4.0], [0.0, 5.0]])
-        >>> clears_ceiling(start, velocity, WorldConfig())  # they rise by 0.8 m and by 1.25 m, of 0.92 m
+        >>> clears_ceiling(start, velocity, WorldConfig())  # rise by 0.8 m and by 1.25 m; 0.92 m are free
         tensor([ True, False])
     """
     loss = world.gravity * world.time_step / world.substeps  # loss of upward speed in each substep
@@ -69,15 +69,15 @@ def will_hit(
     """Returns whether a ball in free flight reaches a goal before it touches anything.
 
     Args:
-        start: [..., 2], of the ball.
-        velocity: [..., 2], of the ball.
-        goal: [..., 2].
+        start: [..., 2], position of the ball.
+        velocity: [..., 2], velocity of the ball.
+        goal: [..., 2], position of the goal.
         world: the constants of the world.
         wall: whether there is a wall.
         within: how near to the goal, in meters, the ball must be at the end of a time step.
 
     Returns:
-        [...] of bool.
+        Mask [...] of the balls that reach their goal.
 
     Example:
         >>> goal, world = torch.tensor([4.0, 2.5]), WorldConfig()

@@ -19,8 +19,8 @@ from torchrl_her_envs.throwing.experts.hand import HandSkill
 from torchrl_her_envs.throwing.tasks import Task, WorldConfig
 
 _CHUNK = 16  # plans made at once: each compares thousands of throws, and all should fit into the cache
-_PLANNED = 0.8  # share of the threshold by which a planned throw may miss the goal ...
-_LET_GO = 0.9  # ... and a throw on release: a little more, so that rounding never spoils a plan
+_PLANNED = 0.8  # share of the threshold by which a planned throw may miss the goal
+_LET_GO = 0.9  # the same share on release; it is larger, so that rounding never spoils a plan
 
 
 class Skill(Protocol):
@@ -62,11 +62,11 @@ class Controller(TensorDictModuleBase):
         task: the task, see :data:`~torchrl_her_envs.TASKS`.
         world: the constants of the world.
         threshold: distance below which a goal is achieved, in observed coordinates; the task's if None. With
-            far smaller ones the arm may find no throw, since it tries a grid of throws.
+            a far smaller one the arm may find no throw, since it tries a grid of throws.
         num_links: number of links of the arm, for the robot's tasks.
 
     Raises:
-        ValueError: an arm that has not two links.
+        ValueError: the arm does not have two links.
 
     Example:
         >>> from torchrl_her_envs import make_controller, make_env
@@ -145,7 +145,7 @@ def make_controller(env: EnvBase) -> Controller:
 
     Raises:
         TypeError: there is no throwing environment below the transforms.
-        ValueError: an arm that has not two links.
+        ValueError: the arm does not have two links.
 
     Example:
         >>> from torchrl_her_envs import make_env

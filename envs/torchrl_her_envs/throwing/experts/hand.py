@@ -35,12 +35,12 @@ class HandSkill:
     def throw(self, joints: Tensor, goal: Tensor, *, within: float) -> Tensor:
         """Returns the next velocity to carry a ball to where it can be thrown, or to throw it.
 
-        A throw is: move to a place (one of a grid, or just here), swing for one step with the velocity of
-        :func:`~.ballistics.throw_velocity`, let go, fly. The quickest throw is taken. No plan is kept, since
+        In a throw, the hand moves to a place of a grid (or stays), swings for one step with the velocity of
+        :func:`~.ballistics.throw_velocity`, and lets go. The quickest throw is taken. No plan is kept, since
         one step later the same throw is still possible, a step shorter.
 
         Returns:
-            [B, 2] in meters a second; more than the hand's speed where the place is farther than one step.
+            Velocities [B, 2] in meters a second; above the hand's speed if the place is several steps away.
             If no throw works, the velocity is meaningless.
 
         Example:
@@ -70,16 +70,14 @@ def _grid(hand: Effector, world: WorldConfig) -> Tensor:
 
 
 def _aims(goal: Tensor, world: WorldConfig, *, within: float) -> Tensor:
-    """Returns points [B, 2, 2] to throw at: the goal's middle and, close behind the wall, its far edge."""
+    """Returns points [B, 2, 2] to throw at: a goal's middle, and its far edge for goals behind the wall."""
     aims = goal.unsqueeze(1) + torch.tensor([[0.0, 0.0], [within, 0.0]])
     return aims.clamp(max=(1.0 - world.ball_radius) * world.size)
 
 
 def _steps_to(gap: Tensor, stride: float) -> Tensor:
-    """Returns the steps that a hand needs for a way [..., 2], at up to a stride a step in each direction."""
-    return (
-        gap.abs().amax(-1) / stride - 1e-3
-    ).ceil()  # a thousandth of a stride, as by rounding, counts as arrived
+    """Returns the steps of a hand for a way [..., 2], with at most ``stride`` a step in each direction."""
+    return (gap.abs().amax(-1) / stride - 1e-3).ceil()  # rounding may leave a thousandth of a stride
 
 
 def _can_throw(start: Tensor, velocity: Tensor, hand: Effector, world: WorldConfig, *, wall: bool) -> Tensor:

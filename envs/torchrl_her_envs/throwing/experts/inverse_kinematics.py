@@ -47,8 +47,8 @@ def nearest_turn(joints: Tensor, point: Tensor, base: Tensor, length: float) -> 
     """Returns the turn [..., 2] of the joints to the solution that the slower joint reaches sooner.
 
     Args:
-        joints: [..., 2], the angles now.
-        point: [..., 2], where the end shall be.
+        joints: [..., 2], the present angles.
+        point: [..., 2], where the end of the arm should be.
         base: [2], position of the first joint.
         length: total length of the two links.
 

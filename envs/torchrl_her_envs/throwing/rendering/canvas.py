@@ -44,7 +44,7 @@ class Canvas:
 
     Args:
         size: side of the finished picture in pixels.
-        background: color of all of it.
+        background: color of the background.
 
     Raises:
         ValueError: ``size`` is too small.
@@ -130,7 +130,7 @@ class Canvas:
         self.disc(end, thickness / 2, fill=fill)
 
     def stamp(self, sprite: Image.Image, center: Point) -> None:
-        """Draws a small picture with opacity, in pixels of the large one, around a point."""
+        """Draws a small picture with opacity, at the scale of the large one, centered at a point."""
         x, y = self._at(center)
         corner = (round(x - sprite.width / 2), round(y - sprite.height / 2))
         self._image.paste(sprite, corner, sprite)
@@ -142,7 +142,7 @@ class Canvas:
 
     def _use(self, image: Image.Image) -> None:
         self._image = image
-        self._draw = ImageDraw.Draw(image, "RGBA")  # on an RGB image this blends
+        self._draw = ImageDraw.Draw(image, "RGBA")  # blends colors on an RGB image
 
     def _at(self, point: Point) -> Point:
         return (MARGIN + point[0]) * self._scale, (MARGIN + 1 - point[1]) * self._scale

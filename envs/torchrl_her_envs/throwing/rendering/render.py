@@ -43,8 +43,8 @@ def render(
 ) -> Tensor:
     """Draws some environments of a batch as they are now, and changes nothing in them.
 
-    The region that the hand or arm reaches is red, the one that goals come from is blue. The ring of a
-    black hole ends where the goal does. Use :func:`~torchrl_her_envs.to_pixel` to find a point.
+    The region that the hand or arm reaches is red, the region of goals is blue. A black hole is as large as
+    its goal. Use :func:`~torchrl_her_envs.to_pixel` to find a point.
 
     Args:
         env: the throwing environment.
@@ -119,7 +119,7 @@ def _draw_world(canvas: Canvas, env: Scene, world: int, trail: Sequence[Tensor])
     now, size, closed = env.worlds, env.world.size, bool(env.worlds.closed[world])
     grip = _point(now.grip[world] / size)
     if env.task.throws:
-        # Both are shown coordinates, which span 2; the threshold is the black hole's radius unless changed.
+        # Goal and threshold are in observed coordinates, which span 2; the threshold is usually the radius.
         sprites.draw_hole(canvas, _point((now.goal[world] + 1) / 2), env.threshold / 2)
     sprites.draw_trail(canvas, [_point(balls[world] / size) for balls in trail])
     if env.task.effector == "arm":

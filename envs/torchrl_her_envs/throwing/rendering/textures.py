@@ -1,4 +1,4 @@
-"""The two things that are shaded pixel by pixel: a basketball and a black hole."""
+"""Sprites that are shaded pixel by pixel: a basketball and a black hole."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ Array = NDArray[np.float64]
 
 # rotation of the basketball about x, y and z, so that seams cross off its center
 _TILT = np.radians((24.0, -20.0, 14.0))
-_SEAM_WIDTH = 0.07  # to each side, as a fraction of the radius
+_SEAM_WIDTH = 0.07  # half of a seam's width, as a fraction of the radius
 _HORIZON = 0.5  # dark part of the black hole, as a fraction of its radius
-_RIM = 0.06  # ... and the width of the line in which the glow ends
+_RIM = 0.06  # width of the line at which the glow ends, as a fraction of the radius
 _SWIRL = 2.2  # how far the arms of the glow are wound up, in radians for each factor of e in radius
 
 
@@ -32,7 +32,7 @@ def basketball(radius: int) -> Image.Image:
     x, y, rim = _grid(radius)
     z = np.sqrt(np.clip(1 - rim**2, 0, 1))
     u, v, _ = np.einsum("ij,j...->i...", _rotation(), np.stack((x, y, z)))
-    # Two great circles and a curve that bends away from one of them, as on the real thing.
+    # Two great circles and a curve that bends away from one of them, as on a real ball.
     seams = np.minimum(
         np.minimum(np.abs(u), np.abs(v)), np.abs(np.sqrt(np.clip(u**2 - 0.55 * v**2, 0, 1)) - 0.55)
     )
