@@ -14,7 +14,7 @@ from torchrl_her_envs.throwing.tasks import TASKS
 if TYPE_CHECKING:  # loads torch
     from torchrl.envs import EnvBase
 
-GYM = "gym:"  # before the id of an environment of gymnasium's
+GYM = "gym:"  # prefix of the id of a gymnasium environment
 _OWN = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*")  # module:function
 _OTHERS = f"or {GYM}ID for one of gymnasium's, or my_module:make_env for a TorchRL environment of your own"
 _ALIKE = 0.6  # the least similarity, from 0 to 1, at which another name is suggested

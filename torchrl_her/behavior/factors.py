@@ -84,7 +84,7 @@ class Successes:
     """Success rates of R runs: exponential moving averages over recent episodes.
 
     Args:
-        runs: R.
+        runs: R, the number of independent runs.
 
     Keyword Args:
         memory: number of later episodes after which an episode's weight has fallen to 1 / e of its first
@@ -148,7 +148,7 @@ class InverseDensity(GoalFactor):
     def __call__(self, candidates: GoalCandidates) -> Tensor:
         parts = zip(candidates.goals.split(list(candidates.counts)), candidates.known, strict=True)
         logs = torch.cat([self._log_density(goals, known) for goals, known in parts if len(goals)])
-        return (logs.amin(1, keepdim=True) - logs).exp()  # 1 for the rarest
+        return (logs.amin(1, keepdim=True) - logs).exp()  # 1 for the rarest goal
 
     def _log_density(self, goals: Tensor, known: Tensor) -> Tensor:
         scale = goal_scale(known)
@@ -171,7 +171,7 @@ class ValueCutoff(GoalFactor):
         values: function that returns values of goals, such as :class:`~torchrl_her.behavior.GoalValues`.
 
     Keyword Args:
-        runs: R.
+        runs: R, the number of independent runs.
         cutoff: initial and greatest value of the cut-off.
         floor: least value of the cut-off.
         step: how far the cut-off moves in ``memory`` episodes.
@@ -253,7 +253,7 @@ class DiscoverScore(GoalFactor):
         values: function that returns values of goals, such as :class:`~torchrl_her.behavior.GoalValues`.
 
     Keyword Args:
-        runs: R.
+        runs: R, the number of independent runs.
         beta: how much the critics' disagreement counts.
         alpha: initial value of alpha.
         step: how far alpha moves in ``memory`` episodes if their success rate is off the target by 1.

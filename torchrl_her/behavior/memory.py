@@ -21,7 +21,7 @@ class AchievedGoals:
         capacity: number of goals that each run keeps.
 
     Keyword Args:
-        runs: R.
+        runs: R, the number of independent runs.
 
     Raises:
         ValueError: ``capacity`` or ``runs`` is below 1; a run adds more goals at once than its capacity.

@@ -46,7 +46,7 @@ class BehaviorGoals(Transform):
     | MEGA | none | | ``InverseDensity``, ``ValueCutoff`` | True |
     | DISCOVER | none | | ``DiscoverScore``; with a single critic ``InverseDensity``, too | True |
 
-    In a curriculum, put it behind :class:`~torchrl_her.StateToObs` and before :class:`~torchrl_her.ZeroPad`.
+    In a curriculum, put it after :class:`~torchrl_her.StateToObs` and before :class:`~torchrl_her.ZeroPad`.
     If episodes have stages, ``stage_key`` restricts it to those in ``stage``; if runs have stages, switch it
     on and off with :meth:`set_active`.
 
@@ -68,7 +68,7 @@ class BehaviorGoals(Transform):
         real_share: share of the episodes in which the task's own goal stays.
         candidates: number of achieved goals drawn for each episode, of which one is proposed.
         memory: number of goals that each run remembers.
-        runs: R.
+        runs: R, the number of independent runs.
         generators: generators, one for each run; None for torch's own, with one run only.
         achieved_reward: the reward of an achieved goal.
         continues_after_termination: whether the environment can be stepped further after it terminated an

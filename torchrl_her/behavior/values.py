@@ -29,7 +29,7 @@ class GoalValues:
         actor: the greedy policy.
 
     Keyword Args:
-        runs: R, whose networks are stacked.
+        runs: R, the number of runs, whose networks are stacked.
         before_actor: function that changes the rows before the actor reads them, for example
             :class:`~torchrl_her.ZeroPad`. The rows are R equal blocks, in the order of the runs.
         before_critic: function that changes these rows before the critics read them, for example
@@ -68,7 +68,7 @@ class GoalValues:
 
         Args:
             observation: [m, o], one for each of m episodes, or [m, c, o], one for each goal; sorted by run.
-            goals: [m, c, g], c for each episode, or [m, 1, g], one for all observations of an episode.
+            goals: [m, c, g], c goals for each episode, or [m, 1, g], one for all observations of an episode.
             counts: number of episodes of each run; the sum is m.
 
         Returns:

@@ -33,7 +33,7 @@ class GuidedExploration(TensorDictModuleBase):
     episode's own stage. With ``per="step"`` it acts as in the stage after the last one whose goal is achieved
     at that moment. So the goal of a stage must include all that the next stage requires.
 
-    Put it behind the policy and before noise. The environment must have TorchRL's ``InitTracker``. The
+    Put it after the policy and before noise. The environment must have TorchRL's ``InitTracker``. The
     environments of R runs are R equal blocks of the batch, in the order of the runs. Under
     ``set_exploration_type(ExplorationType.DETERMINISTIC)`` it does nothing.
 
@@ -57,7 +57,7 @@ class GuidedExploration(TensorDictModuleBase):
             None before the first step.
 
     Raises:
-        ValueError: the share is outside of [0, 1], or ``per`` is another word.
+        ValueError: the share is outside of [0, 1], or ``per`` is neither ``"episode"`` nor ``"step"``.
 
     Example:
         >>> from tensordict.nn import TensorDictModule, TensorDictSequential

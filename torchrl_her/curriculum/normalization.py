@@ -29,7 +29,7 @@ def count_inputs(
 
     Hand it to the writer as ``HERWriter(on_write=functools.partial(count_inputs, norm, progress))``. Inputs
     that a stage does not use are left out. In the buffer, :class:`~torchrl_her.modules.NormalizeBatch` comes
-    behind ``ZeroPad``.
+    after ``ZeroPad``.
 
     Args:
         norm: normalization of the input.

@@ -26,7 +26,7 @@ class EpisodeStages(CurriculumProgress):
         curriculum: the stages.
 
     Keyword Args:
-        runs: R.
+        runs: R, the number of independent runs.
         generators: generators, one for each run; None for torch's own, with one run only.
         task_share: share of the episodes that are played in the last stage, the full task; the others are
             drawn evenly from the stages below. None gives all stages the same probability.

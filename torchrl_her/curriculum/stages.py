@@ -30,7 +30,7 @@ class CurriculumStage:
     """Stage of a curriculum: the entries of the state that are its observation and its goals.
 
     Args:
-        name: for messages and reports.
+        name: name of the stage, for messages and reports.
         observation, achieved_goal, desired_goal: indices into the state vector, or names that the argument
             ``names`` of :class:`~torchrl_her.Curriculum` translates to indices.
         constant_goal: one goal for all episodes, as a gap in a wall, in place of ``desired_goal``; in the
@@ -117,21 +117,21 @@ class Curriculum:
     """Stages in the order in which they are trained, the last one being the full task.
 
     The network's input is, in each stage, [its n observation entries | its desired goal | zeros],
-    as wide as the last stage's. Goals that have fewer entries than the last stage's have zeros behind them.
+    as wide as the last stage's. Goals that have fewer entries than the last stage's are followed by zeros.
     Order the state so that a stage's inputs, its observation and then its desired goal, are the first inputs
     of the next stage. Inputs then keep their meaning, and what was learned carries over: in the hand tasks
     the inputs are [hand | ball] for reaching and [hand | ball | speed | black hole] for throwing.
 
     Args:
         stages: stages in the order of training, one or more.
-        state_width: width of the state vector, the real observation with the real goal behind it.
+        state_width: width of the state vector, the real observation followed by the real goal.
 
     Keyword Args:
         names: indices into the state, for each name that stages use in place of indices.
 
     Attributes:
         stages: the stages, with indices in place of names and of constant goals.
-        appended: the zero and the constant goals that :meth:`extend` puts behind a state.
+        appended: the zero and the constant goals that :meth:`extend` appends to a state.
         observation_width, goal_width: widths of observations and goals in all stages: the widths of the
             last stage, as shorter ones are followed by zeros.
         input_width: width of the network's input.
@@ -221,7 +221,7 @@ class Curriculum:
         """Returns the observation, the achieved and the desired goal of states as a stage shows them.
 
         Args:
-            state: [..., state_width].
+            state: [..., state_width], state vectors.
             stage: index of the stage, from 0.
 
         Returns:
@@ -294,7 +294,7 @@ class CurriculumProgress:
         curriculum: the stages.
 
     Keyword Args:
-        runs: R.
+        runs: R, the number of independent runs.
         window: number of samples that are averaged; with fewer a run stays in its stage.
         success_threshold: the mean at which a stage ends.
         patience: number of evaluations (calls of :meth:`record`) after which a stage ends although the mean

@@ -314,7 +314,7 @@ class StateToObs(_StageTransform):
 class StageOutcomes(Transform):
     """Counts successes by stage for :class:`~torchrl_her.curriculum.EpisodeStages`, as episodes end.
 
-    Put it behind all transforms that decide where episodes end. Episodes whose goal was proposed
+    Put it after all transforms that decide where episodes end. Episodes whose goal was proposed
     (:class:`~torchrl_her.behavior.BehaviorGoals`) do not count, since their success says little about the
     stage's own goals.
 

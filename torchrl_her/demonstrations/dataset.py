@@ -124,7 +124,7 @@ class Demonstrations:
 
         Args:
             index: [m] int64, row of each transition.
-            lengths: [e] int64, which sum to m.
+            lengths: [e] int64, lengths of the new episodes, which sum to m.
 
         Keyword Args:
             rows: [n], transitions to take from; None for the demonstrations' own.

@@ -63,12 +63,12 @@ def in_stage(
 ) -> Demonstrations:
     """Converts demonstrations of the full task to the view of a stage, like :class:`~torchrl_her.StateToObs`.
 
-    In stages below the last, they end where the stage's goal is achieved. All others are truncated at their
-    end, since an end by the environment says nothing about the stage's goal.
+    In stages below the last, demonstrations end where the stage's goal is achieved. All others are truncated
+    at their end, since an end by the environment says nothing about the stage's goal.
 
     Args:
-        demonstrations: of the full task; [observation | desired goal] is the curriculum's state.
-        curriculum: its stages.
+        demonstrations: recorded in the full task; [observation | desired goal] is the curriculum's state.
+        curriculum: the curriculum that has the stage.
         stage: index of the stage, from 0.
         task_reward: reward of the full task, for a last stage without a threshold; None keeps the recorded
             rewards.
@@ -95,7 +95,7 @@ def in_stage(
 
 
 def _until_first(end: Tensor, demonstrations: Demonstrations) -> tuple[Tensor, Tensor]:
-    """Returns the rows [m] of each episode up to its first ``end`` (a mask [n]), and their number [E]."""
+    """Returns the rows [m] up to each episode's first ``end`` (a mask [n]), and the counts of these [E]."""
     episode, rows = demonstrations.episode, torch.arange(len(end))
     first = torch.full_like(demonstrations.lengths, len(end))
     first = first.scatter_reduce(0, episode[end], rows[end], "amin")

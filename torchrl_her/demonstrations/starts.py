@@ -25,7 +25,7 @@ class DemonstrationStarts(Transform):
     The environment below must have a method ``start_at(states, which)``, as this library's throwing and toy
     tasks have (:meth:`torchrl_her_envs.BatchedEnv.start_at`). Put this transform first, directly around that
     environment. If a later transform changes what ends an episode, as :class:`~torchrl_her.StateToObs`
-    does, put the transform that :meth:`outcomes` returns behind it.
+    does, put the transform that :meth:`outcomes` returns after that one.
 
     The environments of R runs are R equal blocks of the batch. Each run has its own random numbers, and
     its starts move back independently. Both are part of the ``state_dict``.
@@ -36,7 +36,7 @@ class DemonstrationStarts(Transform):
 
     Keyword Args:
         share: fraction of the episodes that start at demonstrations.
-        runs: R.
+        runs: R, the number of independent runs.
         generators: generators, one for each run, or None for torch's own.
         **walk: options of :class:`~torchrl_her.demonstrations.WalkBack`: ``width``, ``stride``,
             ``threshold`` and ``samples``.
@@ -208,7 +208,7 @@ def usable(demonstrations: Demonstrations) -> Demonstrations:
     """Selects the demonstrations that have physical states and achieve their goal.
 
     Raises:
-        ValueError: there are none.
+        ValueError: there are no such demonstrations.
     """
     if not demonstrations.states:
         raise ValueError(

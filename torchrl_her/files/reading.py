@@ -55,7 +55,7 @@ def read_tensors(path: str | Path) -> Any:
         path: the file.
 
     Raises:
-        ValueError: the file is damaged, or holds something else, which the message names.
+        ValueError: the file is damaged, or holds more than tensors and plain data, which the message names.
         OSError: the file cannot be read.
 
     Example:
@@ -84,8 +84,8 @@ def load_tensors(file: BinaryIO, *, map_location: torch.device | str = "cpu") ->
         map_location: Device of the loaded tensors.
 
     Raises:
-        MoreThanDataError: the file holds something else; the message is to follow "the file holds".
-        ValueError: the file is damaged; the message is to follow "the file cannot be read:".
+        MoreThanDataError: the file holds other objects, too; the message completes "the file holds ...".
+        ValueError: the file is damaged; the message completes "the file cannot be read: ...".
     """
     begin = file.tell()
     try:
@@ -139,7 +139,7 @@ def _check_description(description: bytes) -> None:
     operands that torch would print are checked.
 
     Raises:
-        MoreThanDataError: the pickle names something else.
+        MoreThanDataError: the pickle names more than tensors and plain data.
         ValueError: the pickle is damaged, or too large with all tuples written in full.
     """
     stack: list[int] = []  # sizes of values; the size of a tuple is the sum over its entries

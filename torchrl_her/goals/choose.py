@@ -154,13 +154,13 @@ def _propose(candidates: Candidates, k: int, weight: Tensor | None, draws: RunDr
     place = None if whole else torch.arange(n, device=line.device) - (counts.cumsum(0) - counts)[line]
 
     def by_line(x: Tensor) -> Tensor:
-        """Returns entries [n, ...] of transitions in the shape [L, longest, ...], padded by line."""
+        """Arranges entries [n, ...] of transitions in one padded row per line, [L, longest, ...]."""
         if place is None:
             return x.reshape(len(counts), longest, *x.shape[1:])
         return x.new_zeros(len(counts), longest, *x.shape[1:]).index_put_((line, place), x)
 
     def numbers(_: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
-        """Returns random numbers; draws none for padding, whose number depends on the other lines."""
+        """Returns random numbers; none is drawn for padding, whose size depends on the other lines."""
         return by_line(draws((n, k), dtype, device))
 
     drawn = draw_weighted(weight, by_line(first), by_line(end), k, generator=numbers)

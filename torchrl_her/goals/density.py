@@ -39,7 +39,7 @@ def log_kernel_density(points: Tensor, samples: Tensor, sigma: Numbers) -> Tenso
     kernel in g dimensions, normalized.
 
     Args:
-        points: [..., g], where the density is wanted.
+        points: [..., g], where to compute the density.
         samples: [n, g] goals of the distribution, n at least 1.
         sigma: standard deviation of the kernel, in the unit of the goals; one number, or one for each
             dimension.
@@ -73,7 +73,7 @@ def log_neighbor_density(points: Tensor, samples: Tensor, k: int, *, least_dista
     grows where samples are few, so this estimate needs no width and remains of use in many dimensions.
 
     Args:
-        points: [..., g], where the density is wanted. A point that is itself a sample is its own neighbor.
+        points: [..., g], where to compute the density. A point that is itself a sample is its own neighbor.
         samples: [n, g] goals of the distribution.
         k: from 1 to n; the distance to the k-th nearest sample gives the density.
 

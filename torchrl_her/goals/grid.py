@@ -100,7 +100,7 @@ class GoalGrid:
         return index
 
     def _along(self, goals: Tensor) -> Iterator[tuple[Tensor, int]]:
-        """Yields for each dimension the position [...] of goals in cells, and the number of cells."""
+        """Yields for each dimension the position [...] of goals, in cells, and the number of cells."""
         for i, (low, size, n) in enumerate(zip(self.low, self.cell_size, self.shape, strict=True)):
             yield (goals[..., i] - low) / size, n
 
@@ -116,7 +116,7 @@ class GoalGrid:
 
 
 def box_target(grid: GoalGrid, low: Numbers, high: Numbers, sigma: Numbers, *, name: str = "") -> Tensor:
-    """Computes the target q* for goals that are uniform in a box, in closed form. Equations 4.3 and 4.7.
+    """Computes the target q* for goals uniform in a box, in closed form (thesis, equations 4.3, 4.7).
 
     The integral over a box is a product of differences of the normal distribution function. If
     sigma is so small that every cell's mass underflows, the cells nearest to the box get all the mass.
@@ -180,7 +180,7 @@ def _sigmas(grid: GoalGrid, sigma: Numbers, label: str = "") -> list[float]:
 
 
 def sampled_target(grid: GoalGrid, samples: Tensor, sigma: Numbers) -> Tensor:
-    """Estimates the target q* from samples of goals of any distribution. Equations 4.2 and 4.7.
+    """Estimates the target q* from samples of any distribution (thesis, equations 4.2, 4.7).
 
     Args:
         grid: grid of cells over all virtual goals.

@@ -51,7 +51,7 @@ class GoalHistogram(GoalWeights):
 
     @property
     def q(self) -> Tensor:
-        """The proposal distribution [cells] of float64; zeros before the first write. Equation 4.8."""
+        """Proposal distribution (thesis, equation 4.8), [cells] of float64; zeros before the first write."""
         return self.counts.double() / self.counts.sum().clamp_min(1)
 
     def divergence_to(self, q_star: Tensor) -> float:
@@ -89,7 +89,7 @@ class GoalHistogram(GoalWeights):
 
 
 class Instructiveness(InstructiveWeights, GoalHistogram):
-    """The weights of IBS: max(q* - q, floor) in a goal's cell. Equations 4.5 and 4.9.
+    """The weights of IBS: max(q* - q, floor) in a goal's cell (thesis, equations 4.5, 4.9).
 
     See :class:`~torchrl_her.goals.InstructiveWeights` for the schedule of the kernel's sigma. A grid is too
     large for goals of many dimensions: use :class:`~torchrl_her.goals.KernelInstructiveness` for them.

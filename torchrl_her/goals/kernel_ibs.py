@@ -17,7 +17,7 @@ from torchrl_her.goals.weights import GOLDEN, spread_evenly
 
 
 class KernelInstructiveness(InstructiveWeights):
-    """The weights of IBS, max(q* - q, floor), by kernel densities in place of a grid. Equations 4.5 and 4.9.
+    """The weights of IBS, max(q* - q, floor), by kernel densities (thesis, equations 4.5, 4.9).
 
     q* is the kernel density of the real goals, and q the kernel density of the virtual goals that were
     written since the buffer was last emptied, with the same kernel. Weights are in units of the largest q*
@@ -37,8 +37,8 @@ class KernelInstructiveness(InstructiveWeights):
             virtual ones are a part that is spread evenly over all that were written.
         log_target: maps goals [m, g] and a sigma to the logarithm of the density q* [m], in place of the
             kernel density of ``goals``.
-        **options: ``start_factor``, ``decay``, ``floor``, as a share of the largest q* of a real goal, and
-            ``subtract`` of :class:`~torchrl_her.goals.InstructiveWeights`.
+        **options: ``start_factor``, ``decay``, ``subtract`` and ``floor`` (here a share of a real goal's
+            largest q*) of :class:`~torchrl_her.goals.InstructiveWeights`.
 
     Attributes:
         written: number of virtual goals since the buffer was last emptied.
@@ -88,7 +88,7 @@ class KernelInstructiveness(InstructiveWeights):
 
     @property
     def divergence(self) -> float:
-        """KL(q || q*) in nats of the two kernel densities at the final sigma, a mean over goals from q.
+        """KL(q || q*) in nats of the two kernel densities at the final sigma, averaged over goals from q.
 
         It is 0 if virtual goals are distributed like the real ones; NaN before the first write.
         """

@@ -28,8 +28,8 @@ class RewardFunction(Protocol):
     The achieved goal comes first, as in gymnasium's ``compute_reward``. A function that has an attribute
     ``info_keys`` gets a third argument, the info: a tensordict of these entries of the transition, whose
     dimensions [...] are broadcast against those of the goals. Entries are read under ``next``, or in the root
-    if ``next`` lacks them, as it lacks ``action``. The filter needs the reward before the action, and looks
-    in the root first.
+    if ``next`` lacks them, as it lacks ``action``. For the goals achieved before the action, which the filter
+    of relabeling asks about, they are read in the root first.
     """
 
     def __call__(self, achieved_goal: Tensor, desired_goal: Tensor, /) -> tuple[Tensor, Tensor]: ...
@@ -39,7 +39,7 @@ def distance(achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
     """Returns the Euclidean distance between goals.
 
     Args:
-        achieved_goal: [..., g].
+        achieved_goal: [..., g], the achieved goals.
         desired_goal: [..., g], broadcast against ``achieved_goal``.
 
     Returns:
@@ -56,9 +56,9 @@ def achieved(achieved_goal: Tensor, desired_goal: Tensor, threshold: float) -> T
     """Returns whether the achieved goal is nearer to the desired goal than a threshold.
 
     Args:
-        achieved_goal: [..., g].
+        achieved_goal: [..., g], the achieved goals.
         desired_goal: [..., g], broadcast against ``achieved_goal``.
-        threshold: in the unit of the goals.
+        threshold: distance below which a goal is achieved, in the unit of the goals.
 
     Returns:
         Mask [...] of achieved goals.
@@ -130,7 +130,7 @@ class EnvReward:
         *,
         info_keys: Sequence[NestedKey] = (),
     ) -> None:
-        if isinstance(info_keys, str):  # a string is a sequence of letters
+        if isinstance(info_keys, str):  # its letters would be taken for keys
             raise TypeError(f"info_keys must be a list, got {info_keys!r}: write [{info_keys!r}]")
         self.compute_reward = compute_reward
         self.compute_terminated = compute_terminated
@@ -151,7 +151,7 @@ def outcomes(reward_fn: RewardFunction | None, achieved_goal: Tensor, *parts: Te
 
     Args:
         reward_fn: function whose ``info_keys`` name the entries; None for no info.
-        achieved_goal: [..., g].
+        achieved_goal: [..., g], the achieved goals.
         *parts: tensordicts [...] of the same transitions, such as ``next`` and the root. Each entry is taken
             from the first part that has it.
 
@@ -268,7 +268,7 @@ def missed(
     Args:
         reward_fn: maps (achieved, desired) goals to (reward, terminated).
         achieved: goals [..., g], with the info that the function reads (``outcomes``).
-        desired_goal: [..., g], broadcast against them.
+        desired_goal: [..., g], broadcast against the achieved goals.
         achieved_reward: the reward of an achieved goal.
 
     Raises:
@@ -313,7 +313,7 @@ def is_achieved(
         achieved_reward: the least reward of an achieved goal.
 
     Returns:
-        [...] of bool.
+        Mask [...] of the steps that achieved their goals.
 
     Example:
         >>> from tensordict import TensorDict

@@ -33,7 +33,7 @@ class StackedLinear(nn.Module):
     Args:
         inputs: width of the input.
         outputs: width of the output.
-        runs: R.
+        runs: R, the number of independent runs.
         bound: weights are uniform in [-bound, bound]; None for ``1 / sqrt(inputs)``.
 
     Example:
@@ -62,7 +62,7 @@ class StackedBatchNorm(nn.Module):
 
     Args:
         width: Width of the input.
-        runs: R.
+        runs: R, the number of independent runs.
 
     Example:
         >>> norm, rows = StackedBatchNorm(2), torch.tensor([[[1.0, 4.0], [3.0, 8.0]]])
@@ -102,7 +102,7 @@ class StackedLayerNorm(nn.Module):
 
     Args:
         width: width of the input.
-        runs: R.
+        runs: R, the number of independent runs.
 
     Example:
         >>> StackedLayerNorm(2)(torch.tensor([[[1.0, 3.0]]])).round(decimals=3).tolist()
@@ -126,7 +126,7 @@ class NetworkShape:
     Args:
         hidden: width of each hidden layer.
         depth: number of hidden layers, at least 2.
-        activation: function behind each hidden layer: ``"relu"``, ``"tanh"`` or ``"elu"``.
+        activation: function after each hidden layer: ``"relu"``, ``"tanh"`` or ``"elu"``.
         norm: ``"layer"`` for layer normalization before each activation, ``"none"`` without; ``"batch"`` for
             batch normalization of the hidden layers and, in a critic, of its input, but not in actors.
 
@@ -190,7 +190,7 @@ class GoalNet(nn.Module):
         )
 
     def _last_layers(self, hidden: int, actions: int) -> Sequence[nn.Module]:
-        """Makes the layers behind the hidden ones."""
+        """Makes the layers after the hidden ones."""
         return [StackedLinear(hidden, actions, runs=self.runs)]
 
     def forward(self, *inputs: Tensor) -> Any:
@@ -294,7 +294,7 @@ def take_run(state: Mapping[str, Tensor], run: int, runs: int) -> dict[str, Tens
     Args:
         state: ``state_dict()`` of the stacked network.
         run: the run's number, from 0.
-        runs: R.
+        runs: R, the number of independent runs.
     """
     return {key: value.chunk(runs)[run].clone() for key, value in state.items()}
 

@@ -97,7 +97,7 @@ class RunningNorm(nn.Module):
         widths: widths of the entries that are normalized, by their keys.
 
     Keyword Args:
-        runs: R.
+        runs: R, the number of independent runs.
         clip: normalized values are clipped to [-clip, clip].
         least_std: least standard deviation, in the unit of the values, so that coordinates that hardly ever
             change are not blown up. None for one ten-thousandth of their mean, whatever the unit.
@@ -145,7 +145,7 @@ class RunningNorm(nn.Module):
         self.runs, self.clip, self.least_std, self.frozen = runs, clip, least_std, False
         ends = list(accumulate(self.widths.values(), initial=0))
         self._columns = {key: slice(*bounds) for key, bounds in zip(self.widths, pairwise(ends), strict=True)}
-        # Without values, mean 0 and variance 1 leave all as it is.
+        # Before the first values, mean 0 and variance 1 make normalization change nothing.
         for name, start in (("n", 0.0), ("mean", 0.0), ("var", 1.0)):
             self.register_buffer(name, torch.full((runs, ends[-1]), start, dtype=torch.float64))
 
@@ -285,7 +285,7 @@ class RunningNorm(nn.Module):
         if not values.is_floating_point():  # means and deviations would be rounded to whole numbers, too
             values = values.to(torch.get_default_dtype())
         n, mean, std = (statistic[:, columns] for statistic in (self.n, self.mean, self.std))
-        limit = torch.where(n > 0, self.clip, torch.inf)  # values stay as they are before the first update
+        limit = torch.where(n > 0, self.clip, torch.inf)  # before the first update nothing is clipped
         mean, std, limit = (tensor.to(values).unsqueeze(1) for tensor in (mean, std, limit))
         return normalize(by_run(values, self.runs), mean, std, limit).view(values.shape)
 

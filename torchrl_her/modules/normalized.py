@@ -96,7 +96,7 @@ class NormalizedPolicy(TensorDictModuleBase):
     """Runs a policy on normalized inputs, and leaves the observations and goals in the tensordict unchanged.
 
     Only the actor's outputs are put into the tensordict, so collectors yield raw observations and goals, as
-    buffers must store them. Exploration belongs behind this module, or within the actor. The statistics are
+    buffers must store them. Exploration belongs after this module, or within the actor. The statistics are
     part of this module's ``state_dict``, so checkpoints have them, and collectors in other processes get them
     with the weights.
 

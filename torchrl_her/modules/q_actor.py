@@ -83,7 +83,7 @@ def make_q_actor(
     Args:
         widths: widths of the inputs, one for each of ``in_keys``.
         actions: number of actions; they are integers (``Categorical``).
-        shape: its hidden layers.
+        shape: shape of the hidden layers.
         runs: R, how many independent networks.
         in_keys: keys of the inputs; the goal must be among them.
         value_key: key under which the value of a given action is written.

@@ -118,10 +118,10 @@ def make_stochastic_actor(
     Args:
         widths: widths of the inputs, one for each of ``in_keys``.
         action_spec: spec of one environment's action, with its bounds.
-        shape: its hidden layers.
+        shape: shape of the hidden layers.
         runs: R, how many independent actors.
         in_keys: keys of the inputs; the goal must be among them.
-        generators: generators of the actions that each run draws; None for torch's own.
+        generators: generators from which the runs draw their actions; None for torch's own.
 
     Example:
         >>> from tensordict import TensorDict

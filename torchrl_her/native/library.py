@@ -141,7 +141,7 @@ def _load_shipped(source: str, real: str) -> ctypes.CDLL:
 def _load_compiled(compiler: Sequence[str], source: str, headers: Sequence[str], real: str) -> ctypes.CDLL:
     folder = Path(__file__).parent
     text = "".join((folder / name).read_text(encoding="utf-8") for name in (source, *headers))
-    # The processor is part of the name: machines with other instruction sets may share a cache.
+    # The processor is part of the file's name: machines with other instruction sets may share a cache.
     processor = (platform.machine(), platform.processor(), _processor_flags())
     made_of = (text, real, *compiler, _version(compiler), str(_FLAGS), str(_EXTRAS), *processor)
     name = hashlib.sha256("\n".join(made_of).encode()).hexdigest()[:20]

@@ -60,8 +60,8 @@ def make_ddpg_loss(
     """Makes TorchRL's DDPG loss with clamped targets, and target networks for actor and critic.
 
     Args:
-        actor: from :func:`~torchrl_her.make_actor`.
-        critic: from :func:`~torchrl_her.make_critic`.
+        actor: actor from :func:`~torchrl_her.make_actor`.
+        critic: critic from :func:`~torchrl_her.make_critic`.
         targets: discount, and the range of rewards; targets are clamped to the returns it allows.
         terms: further terms of the actor's loss.
         reduction: ``"none"`` gives one loss for each transition [R, B], as stacked networks need it.

@@ -19,7 +19,7 @@ def make_dqn_loss(
     """Makes TorchRL's double DQN loss (van Hasselt et al., 2016) with a target network and clamped targets.
 
     Args:
-        actor: from :func:`~torchrl_her.modules.make_q_actor`.
+        actor: actor from :func:`~torchrl_her.modules.make_q_actor`.
         targets: discount, and the range of rewards; targets are clamped to the returns it allows.
         reduction: ``"none"`` gives one loss for each transition [R, B], as stacked networks need it.
 

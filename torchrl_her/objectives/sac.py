@@ -132,7 +132,7 @@ def make_sac_loss(
     Haarnoja et al., Soft actor-critic algorithms and applications, 2018.
 
     Args:
-        actor: from :func:`~torchrl_her.modules.make_stochastic_actor`, with its generators. Each run of
+        actor: actor from :func:`~torchrl_her.modules.make_stochastic_actor`, with its generators. Each run of
             stacked networks has its own temperature.
         critic: a critic from :func:`~torchrl_her.make_critic`, to which TorchRL adds a second of the same
             shape, or a list of all critics. Targets and policy use the least of the critics' values.

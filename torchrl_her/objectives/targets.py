@@ -70,7 +70,7 @@ class Targets:
     def estimator(
         self, value_network: TensorDictModule | None = None, *, value_key: NestedKey = "state_action_value"
     ) -> ClampedTD0:
-        """Makes the targets for ``loss.make_value_estimator`` of any loss of TorchRL.
+        """Makes an estimator of these targets for ``loss.make_value_estimator`` of any loss of TorchRL.
 
         Args:
             value_network: module that computes the next state's value; None if the loss passes the value.
@@ -78,7 +78,7 @@ class Targets:
         """
         least, greatest = self.reward_range or (-math.inf, math.inf)
         estimator = ClampedTD0(
-            low=min(least, least / (1.0 - self.gamma)),  # one step, or steps forever
+            low=min(least, least / (1.0 - self.gamma)),  # the return of one step, or of endless steps
             high=max(greatest, greatest / (1.0 - self.gamma)),
             gamma=self.gamma,
             value_network=value_network,
@@ -88,7 +88,7 @@ class Targets:
 
 
 class _BuffersToo(TargetNetUpdater):
-    """Updates the buffers of target networks like their weights, which TorchRL's updates do not."""
+    """Updates the buffers of target networks, too; TorchRL's updates move only their weights."""
 
     @cached_property
     def _buffers(self) -> dict[str, list[Any]]:
@@ -129,7 +129,7 @@ class RunsHardUpdate(HardUpdate, _BuffersToo):
 
     Keyword Args:
         interval: gradient steps between two copies.
-        runs: R.
+        runs: R, the number of independent runs.
 
     Attributes:
         counts: gradient steps of each run.

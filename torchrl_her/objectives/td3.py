@@ -22,7 +22,7 @@ from torchrl_her.objectives.targets import Targets
 class PenalizedTD3Loss(TD3Loss):
     """TorchRL's TD3 loss with further terms in its actor's loss, and separate random numbers for each run.
 
-    Targets have the least value of all critics, or of some that are drawn at random in each gradient step, as
+    Targets use the least value of all critics, or of some that are drawn at random in each gradient step, as
     in REDQ (Chen et al., 2021). In the second case the actor follows the mean of all critics instead of the
     first one.
 
@@ -122,7 +122,7 @@ def make_td3_loss(
     Fujimoto et al., Addressing function approximation error in actor-critic methods, 2018.
 
     Args:
-        actor: from :func:`~torchrl_her.make_actor`.
+        actor: actor from :func:`~torchrl_her.make_actor`.
         critic: a critic from :func:`~torchrl_her.make_critic`, to which TorchRL adds a second of the same
             shape, or a list of all critics. Targets use the least of the critics' values.
         action_spec: spec of one environment's action, with its bounds.

@@ -82,7 +82,7 @@ def make_tqc_loss(
     quantile critics, 2020.
 
     Args:
-        actor: from :func:`~torchrl_her.modules.make_stochastic_actor`, with its generators.
+        actor: actor from :func:`~torchrl_her.modules.make_stochastic_actor`, with its generators.
         critic: a critic with M quantiles from ``make_critic(..., outputs=M)``, to which TorchRL adds a second
             of the same shape, or a list of all N critics.
         dropped_quantiles: D; targets leave out the D * N greatest of all N * M quantiles.

@@ -96,7 +96,7 @@ def draw_for_runs(
     source are goals of the same episode, or goals of recent episodes that the run remembers.
 
     Args:
-        chunk: Episodes of m runs.
+        chunk: episodes of m runs.
 
     Keyword Args:
         weights: weights of all runs; None for equal weights.

@@ -61,8 +61,8 @@ def windows(start: Tensor, end: Tensor, n_steps: int) -> tuple[Tensor, Tensor]:
     """Returns the places of up to n steps from ``start`` on, all before ``end``.
 
     Args:
-        start: [...] int64.
-        end: [...] int64, the place behind the episode's last one; above ``start``.
+        start: [...] int64, the place of each window's first step.
+        end: [...] int64, one more than the episode's last place; above ``start``.
         n_steps: n.
 
     Returns:

@@ -31,7 +31,7 @@ _SUSPICIOUS = 10  # so many episodes of one step hardly occur by chance
 
 
 class _NotGiven(int):
-    """Default that marks a number as not given."""
+    """Type of a default, to tell it from the same number given by a user."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,11 +48,11 @@ class HindsightOptions:
             two sources that look beyond the episode: ``"actual"``, the desired goals of recent episodes, and
             ``"achieved"``, goals that were achieved in these episodes. ``weights`` and filter act on the
             goals of all sources. None: ``k`` and ``strategy`` count.
-        recent_actual, recent_achieved: number of the newest goals that these two sources remember: one
-            desired goal for each episode, and one achieved goal for each transition. Episodes that are being
-            written are included. If these alone have more goals, a part is kept that is spread evenly over
-            environments and time. A sample unit takes goals from this number of the newest stored episodes or
-            transitions. Large numbers cost time only if the filter refuses nearly all goals.
+        recent_actual, recent_achieved: number of the newest goals that ``"actual"`` and ``"achieved"``
+            remember: one desired goal for each episode, and one achieved goal for each transition. Episodes
+            that are being written are included. If these alone have more goals, a part is kept that is spread
+            evenly over environments and time. A sample unit takes goals from this number of the newest stored
+            episodes or transitions. Large numbers cost time only if the filter refuses nearly all goals.
         per: unit that gets a goal of its own. ``"transition"``: each transition, for learning from single
             transitions. ``"episode"``: each copy of a whole episode, for learning from sequences, as
             recurrent policies do; see :class:`~torchrl_her.HERWriter`.
@@ -60,7 +60,7 @@ class HindsightOptions:
             goal, ``next`` is the one of the last step, and ``steps_to_next_obs`` the number of steps, by
             which TorchRL's losses discount. Transitions end where the reward function terminates, or with the
             episode. Sutton and Barto, Reinforcement Learning, 2018, equation 7.1.
-        gamma: the discount of these sums; needed with ``n_steps`` above 1, and the same as the loss's.
+        gamma: discount of the loss, by which rewards of ``n_steps`` are summed; needed if these are above 1.
         filter_achieved: take no goal that was already achieved in the state before the action
             (Filtered-HER). The reward decides, and not ``terminated``, since many environments never
             terminate. If episodes continue at their goals, transitions at the goal teach the agent to stay
@@ -71,7 +71,7 @@ class HindsightOptions:
         achieved_reward: the reward of an achieved goal; with any lower reward a goal is not achieved. A
             transition that terminated with a lower reward failed, as by a fall: it also terminates for
             virtual goals, with the same reward.
-        exclude: entries to leave out, in the root and under ``next``. ``state`` is one of them because it
+        exclude: entries to leave out, in the root and under ``next``. By default ``state``, because it
             holds the real goal. Add whatever else was computed from the desired goal.
         keys: keys of the goals, in the root and under ``next``, and of reward and flags under ``next``.
         trajectory_key: key of ids that distinguish trajectories; the entry may be missing.
@@ -86,7 +86,7 @@ class HindsightOptions:
     Raises:
         ValueError: a number is not whole, not finite or too small, there is no such strategy or source,
             ``goal_sources`` and another ``k`` or ``strategy`` are given, ``n_steps`` is above 1 without
-            ``gamma`` or with whole episodes, or ``per`` is another word.
+            ``gamma`` or with whole episodes, or ``per`` is neither of its words.
         TypeError: ``exclude`` is a single key, or ``goal_sources`` no mapping.
 
     Example:
@@ -240,8 +240,8 @@ class HindsightBase:
 
     Attributes:
         options: all options; assign another :class:`~torchrl_her.HindsightOptions` to change them.
-        k, strategy, goal_sources, filter_achieved, achieved_reward: the options of that name; they can be
-            set, too.
+        k, strategy, goal_sources, filter_achieved, achieved_reward: the options of these names, which can
+            also be set here.
 
     Raises:
         ValueError: an option is out of its range.

@@ -75,17 +75,17 @@ class _Stored(NamedTuple):
 
 
 class _Chosen(NamedTuple):
-    """The changes that a batch needs."""
+    """The virtual goals that were chosen for a batch, and what else is needed to relabel it."""
 
     shape: torch.Size  # shape of the batch
     rows: Tensor  # [V], places in the flat batch
     goals: Tensor  # [V, g]
     ends: Tensor | None  # [B, 1] of bool, where a sampler of slices ends a slice
-    ahead: tuple[TensorDictBase, NStepReturn] | None  # over several steps: ``next`` of the last one, returns
+    ahead: tuple[TensorDictBase, NStepReturn] | None  # with n steps: ``next`` of the last one, and returns
 
 
 class HERSampleUnit(HindsightBase, SampleUnit):
-    """Gives transitions goals that were achieved later, as they are sampled.
+    """When transitions are sampled, gives some of them goals that were achieved later.
 
     A plain writer stores real transitions, flat or [T, N] (``ndim=2``), and any sampler draws them. Each one
     drawn becomes virtual with probability k / (k + 1), which is the share that a writer with the same k
@@ -123,7 +123,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
             ``"step_offset"`` is the number of steps from a transition's first state to that in which its goal
             was achieved: 1 for what its own action achieved, and below 1 for goals of the past.
             ``"validity_mask"`` marks where the offset counts: at virtual transitions whose goal is of their
-            own episode, those that fill up a slice excepted. Elsewhere the offset is 0. ``"anchor_index"`` is
+            own episode, except for the padding of a slice. Elsewhere the offset is 0. ``"anchor_index"`` is
             the index in the storage.
         **changes: options by name, as in the example; all are listed in
             :class:`~torchrl_her.HindsightOptions`.

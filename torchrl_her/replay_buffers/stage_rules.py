@@ -30,7 +30,7 @@ class StageRule(NamedTuple):
 def split_stages(
     rows: TensorDictBase, episodes: Episodes, run: Tensor | None, key: NestedKey, stages: Sequence[StageRule]
 ) -> Iterator[tuple[int, TensorDictBase, Episodes, Tensor | None]]:
-    """Yields each stage with an index, the transitions as it shows them, its episodes, and their runs.
+    """Yields each stage's index, transitions as it shows them, the episodes to write for it, and their runs.
 
     Args:
         rows: [n], transitions.

@@ -98,7 +98,7 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
     Keyword Args:
         weights: weights by which goals are drawn; None for equal weights. Weights are updated only after the
             goals of a batch are drawn. For several runs a list, one for each run (``goal_weights``).
-        runs: R.
+        runs: R, the number of independent runs.
         generators: R sources of random numbers; None for the buffer's, with one run only.
         stages: for episodes that carry the stage of a curriculum in which they were played, one rule for each
             stage; they take the place of ``reward_fn``. A rule may have all episodes written for its stage,
@@ -240,7 +240,7 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
         """Sets the reward function that relabels the next episodes of a run; None for the writer's.
 
         Raises:
-            ValueError: stages have rewards here, not runs.
+            ValueError: the writer has ``stages``, whose rewards serve all runs.
         """
         if self.stages:
             raise ValueError(f"run {run} has no reward of its own: episodes are relabeled by their stages")

@@ -27,7 +27,7 @@ class RunsAdam(torch.optim.Adam):
         betas, eps: parameters of Adam.
 
     Keyword Args:
-        runs: R.
+        runs: R, the number of independent runs.
 
     Example:
         >>> loss = nn.Linear(1, 2, bias=False)  # as if of two runs

@@ -38,7 +38,7 @@ from torchrl_her.torchrl_private import (
 
 _MAGIC = b"torchrl-her checkpoint 1\n"
 _PIECE = 1 << 26  # bytes between two syncs to disk
-_BODY = len(_MAGIC) + hashlib.sha256().digest_size  # start of torch's file
+_BODY = len(_MAGIC) + hashlib.sha256().digest_size  # where torch's file starts
 _REMAINING = "_remaining_batches"  # rest of a sampler's pass over the data, which TorchRL's states lack
 _PLAIN = (bool, int, float, str, type(None), torch.Size, torch.dtype)
 
@@ -105,7 +105,7 @@ def _check_plain(value: Any, name: str) -> None:
     elif type(value) in (list, tuple):
         for index, entry in enumerate(value):
             _check_plain(entry, f"{name}[{index}]")
-    elif not isinstance(value, Tensor) and type(value) not in _PLAIN:  # numpy's floats are floats, too
+    elif not isinstance(value, Tensor) and type(value) not in _PLAIN:  # numpy's floats pass isinstance
         raise TypeError(f"{name} must be a tensor or plain data, got {type(value).__name__} {value!r}")
 
 
@@ -212,8 +212,8 @@ def load_collector_state_dict(collector: BaseCollector, state: dict[str, Any]) -
     """Restores the state that :func:`~torchrl_her.trainers.collector_state_dict` returned.
 
     Args:
-        collector: made in the same way as the collector that returned the state.
-        state: the state.
+        collector: a collector made in the same way as the one that returned the state.
+        state: the state, as returned or loaded from a file.
     """
     collector_state = {name: value for name, value in state.items() if name != "carrier"}
     if state["carrier"] is None:
@@ -265,7 +265,7 @@ def _block(
             "packed": convert(storage.packed[begin:end]),
             "fields": [tuple(field) for field in storage.fields],
         }
-    rows = storage[:] if storage.ndim > 1 else storage[begin:end]  # the buffer would transform rows
+    rows = storage[:] if storage.ndim > 1 else storage[begin:end]  # the buffer's would be transformed
     return {"entries": rows.apply(convert).to_dict(), "shape": list(rows.batch_size)}
 
 
@@ -275,7 +275,7 @@ def _capacity(buffer: TensorDictReplayBuffer) -> int:
 
 
 def _alone(rows: Tensor) -> Tensor:
-    """Returns rows as a tensor whose storage has no others, without a copy: torch.save writes storages."""
+    """Returns rows, uncopied, as a tensor whose storage has no others, since torch.save writes storages."""
     if not rows.is_contiguous():
         return rows.clone()
     start = rows.storage_offset() * rows.itemsize
@@ -287,8 +287,8 @@ def load_buffer_state_dict(buffer: TensorDictReplayBuffer, state: dict[str, Any]
     """Restores the state that :func:`~torchrl_her.trainers.buffer_state_dict` returned.
 
     Args:
-        buffer: empty, and made in the same way as the buffer that returned the state.
-        state: the state.
+        buffer: an empty buffer, made in the same way as the one that returned the state.
+        state: the state, as returned or loaded from a file.
 
     Raises:
         ValueError: the buffer is not empty, or has another capacity or another kind of sampler.

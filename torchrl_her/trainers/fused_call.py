@@ -34,8 +34,8 @@ class FusedCall:
         fused: algorithm of the loss, and names of its networks.
         kinds: the structures for the type of the weights.
         rows: [R, S * B] transitions of R runs.
-        steps: S.
-        runs: R.
+        steps: S, the number of gradient steps.
+        runs: R, the number of independent runs.
         actor: layers of the actor.
 
     Raises:
@@ -92,7 +92,7 @@ class FusedCall:
         return drawn, critics
 
     def _keep(self, tensor: Tensor) -> int:
-        """Returns the address of a tensor, and keeps the tensor as long as this object."""
+        """Returns the address of a tensor, and keeps the tensor alive as long as this object."""
         self._kept.append(tensor)
         return tensor.data_ptr()
 

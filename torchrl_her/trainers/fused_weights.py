@@ -32,7 +32,7 @@ class FusedWeights:
     Attributes:
         parameters: parameters of the actor, the critics and SAC's temperature.
         actor_tensors, critic_tensors: number of parameters and running statistics of an actor and a critic.
-        critics: N.
+        critics: N, the number of critics.
     """
 
     def __init__(self, loss: LossModule, optimizer: torch.optim.Optimizer, kinds: Structures) -> None:

@@ -42,7 +42,7 @@ class FusedLoss:
     Attributes:
         algorithm: algorithm of the compiled steps.
         actor_net: type of the actor's network.
-        losses: the names of the measured losses.
+        losses: the names of the losses that are reported.
         fixed: attributes of the loss and the values that they must have, besides those of all losses.
         actor: the attribute of the actor, or of the values of discrete actions.
         critic: the attribute of the critic or critics, None if there is none.
@@ -172,8 +172,8 @@ def network_of(module: nn.Module) -> nn.Module:
 def layers_of(net: nn.Module) -> list[Layer] | None:
     """Returns the layers of one of this library's networks, from its input on; None if it has others.
 
-    The tensors of the layers, in the same order, are those of ``net.state_dict()``: weight and bias, behind
-    them scale and shift of a normalization, and the running mean and variance of a batch normalization.
+    The tensors of the layers, in the same order, are those of ``net.state_dict()``: weight and bias, then
+    scale and shift of a normalization, and the running mean and variance of a batch normalization.
 
     Args:
         net: exactly one of this library's types, since a subclass may compute something else.

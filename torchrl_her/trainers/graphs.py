@@ -36,7 +36,7 @@ class GraphLearner(LossLearner):
         optimizer: optimizer of the loss's parameters; it is made ``capturable``.
         target: update that moves the targets in the same way in each step, such as ``SoftUpdate``.
         max_grad_norm: norm to which gradients are clipped, see :class:`~torchrl_her.LossLearner`.
-        runs: R.
+        runs: R, the number of independent runs.
 
     Keyword Args:
         compile: whether ``torch.compile`` is used.
@@ -170,10 +170,10 @@ class _Recorded:
         try:
             # A stream of this device: torch's default for graphs is one of the device that was first used.
             with torch.cuda.graph(graph, stream=torch.cuda.Stream(self._device)):
-                self._out = self._call(self._rows.copy())  # adds entries to the given tensordict
+                self._out = self._call(self._rows.copy())  # a copy, since the call adds entries
         except RuntimeError as error:
             first: BaseException = error
-            while first.__context__ is not None:  # the end of the recording fails, too
+            while first.__context__ is not None:  # later errors follow from the first one
                 first = first.__context__
             reason = next(iter(str(first).splitlines()), type(first).__name__)
             raise RuntimeError(

@@ -25,7 +25,7 @@ class Learner(Protocol):
 
         Args:
             rows: [R, S * B] of R runs; gradient step s takes the rows [:, s * B : (s + 1) * B].
-            steps: S.
+            steps: S, the number of gradient steps.
             idle: runs that do not learn; their rows are ignored.
 
         Returns:
@@ -89,7 +89,7 @@ class LossLearner:
             several runs, and a :class:`~torchrl_her.trainers.RunsAdam` if some runs may be idle.
         target: update of the target networks; None for a loss without them.
         max_grad_norm: norm to which the gradients are clipped, for each network of each run separately.
-        runs: R.
+        runs: R, the number of independent runs.
 
     Example:
         >>> from torchrl_her import make_actor, make_critic, make_ddpg_loss, make_target_updater

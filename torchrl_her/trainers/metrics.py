@@ -16,7 +16,7 @@ def first_episode(done: Tensor) -> Tensor:
     """Returns which steps belong to the first episode.
 
     Args:
-        done: [..., T] of bool.
+        done: [..., T] of bool, whether an episode ends with each step.
 
     Returns:
         Mask [..., T] of these steps.
@@ -40,7 +40,7 @@ def success(
     """Returns whether the goal is achieved at the last step of the episode, as papers on Fetch measure it.
 
     Args:
-        rollout: [N, T].
+        rollout: [N, T], T steps of each of N environments.
         reward_fn: decides which goals are achieved if the rollout lacks the entry ``("next", "is_success")``;
             see :func:`~torchrl_her.goals.is_achieved`.
 
@@ -72,7 +72,7 @@ def final_distance(rollout: TensorDictBase) -> Tensor:
     """Returns the distance of the achieved goal from the desired goal at the last step of the episode.
 
     Args:
-        rollout: [N, T].
+        rollout: [N, T], T steps of each of N environments.
 
     Returns:
         Distances [N], in the unit of the goals.
@@ -88,12 +88,12 @@ def discounted_return(rollout: TensorDictBase, gamma: float, *, tail_reward: flo
     estimates such a return as well.
 
     Args:
-        rollout: [N, T].
+        rollout: [N, T], T steps of each of N environments.
         gamma: discount.
         tail_reward: reward of every step after a truncation, one number or one for each episode [N].
 
     Returns:
-        Returns [N] of the episodes.
+        Returns [N], one for each episode.
 
     Raises:
         ValueError: ``gamma`` is outside of [0, 1).

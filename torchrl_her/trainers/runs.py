@@ -29,10 +29,10 @@ def keep_runs(
     """Protects some runs of a stacked loss and its optimizer from all changes in the ``with`` block.
 
     Args:
-        loss: its tensors have a dimension of R equal blocks, in the order of the runs (see ``run_dims``).
+        loss: loss whose tensors have a dimension of R equal blocks, in the order of the runs (``run_dims``).
         optimizer: optimizer of the loss's parameters.
         kept: the runs that stay unchanged.
-        runs: R.
+        runs: R, the number of independent runs.
 
     Example:
         >>> weight = nn.Linear(1, 2, bias=False)  # as if of two runs
@@ -84,7 +84,7 @@ def clip_by_run(parameters: Sequence[nn.Parameter], max_norm: float, *, runs: in
     Args:
         parameters: parameters of one stacked network; each has R equal blocks, in the order of the runs.
         max_norm: greatest norm of a run's gradient, over all parameters together.
-        runs: R.
+        runs: R, the number of independent runs.
         dim: the dimension of the runs.
 
     Returns:

@@ -100,18 +100,18 @@ class Trainer:
         schedules: objects whose ``step`` is called after each epoch, such as exploration and goal weights.
 
     Keyword Args:
-        runs: R.
+        runs: R, the number of independent runs.
         epoch_frames: environment steps of each run in an epoch. Epochs end with whole batches, so the first n
             epochs together have n times this number, rounded up.
-        frames_per_update: environment steps of each run for each of its gradient steps; 0.5, for example, for
-            two gradient steps for each environment step. They are made after each collected batch.
+        frames_per_update: environment steps of a run per gradient step; 0.5, for example, means two gradient
+            steps per environment step. Gradient steps are made after each collected batch.
         warmup_frames: environment steps of each run before its first gradient step. The gradient steps that
             belong to these frames follow then. With enough frames to end an episode in each environment, all
             runs have transitions to learn from at their first gradient step.
         batch_size: transitions in a gradient step of one run.
         batches_per_sample: gradient steps whose transitions are drawn in one call. Priorities that change
             during these steps count from the next call on.
-        average: average of the policy's weights, which is moved after each update.
+        average: moving average of the policy's weights, updated after the gradient steps of each batch.
 
     Raises:
         ValueError: a number is too small, or the buffer is for another number of runs; when running, a batch
@@ -153,7 +153,7 @@ class Trainer:
         self.frames = self.updates = self.epochs = 0
         self._credit = 0.0  # gradient steps that the frames so far allow and that were not made yet
         self._measured: list[dict[str, Tensor]] | None = None  # in the present epoch
-        self._outside = 0  # frames that were collected by run(), which are part of no epoch
+        self._outside = 0  # frames collected by run(), which belong to no epoch
 
     @property
     def in_epoch(self) -> bool:

@@ -106,7 +106,7 @@ class GoalEnv(EnvBase):
             For each stage its ``name``; ``observation``, ``achieved_goal`` and ``desired_goal``, which are
             lists of indices into the state; ``threshold``, the distance below which a goal is achieved (not
             in the last stage, which has the task's own reward); and ``instructive``, whether IBS weights
-            apply in it. The state is the observation with the desired goal behind it.
+            apply in it. The state is the observation followed by the desired goal.
 
         Raises:
             ValueError: the task has no curriculum.
@@ -120,7 +120,7 @@ class GoalEnv(EnvBase):
         raise ValueError(f"{self.task_name} has no curriculum: give its stages as curriculum=FILE.yaml")
 
     def state_names(self) -> dict[str, list[int]]:
-        """Returns names for entries of the state, which is the observation with the desired goal behind it.
+        """Returns names for entries of the state, which is the observation followed by the desired goal.
 
         The stages of a curriculum may use them in place of indices.
 
@@ -226,7 +226,7 @@ def goal_env(env: EnvBase) -> GoalEnv:
         >>> goal_env(TransformedEnv(make_env("hand_v1"), StepCounter())).max_steps
         50
     """
-    # mypy: an abstract class is as good as others for isinstance.
+    # mypy refuses an abstract class, but isinstance takes it.
     return first_below(env, GoalEnv, "an environment with goals")  # type: ignore[type-abstract]
 
 

@@ -116,7 +116,7 @@ class GoalEnds:
             self.rule = termination
 
     def found(self) -> Ends | None:
-        """Returns the rule that fits the environment's behavior so far; None before it has met a goal.
+        """Returns the rule that fits the environment's behavior so far; None before a goal was achieved.
 
         The environment's own function decides if there is one. If not, and an episode continued at its goal,
         goals never end an episode.

@@ -234,7 +234,7 @@ class OwnGoalEnv(GoalEnv):
         termination: rule that ends an episode at its goal.
         achieved_reward: the least reward at which a goal counts as achieved; the reward of equal goals if
             None.
-        rules: rules found for another such environment; None to find them by some steps.
+        rules: rules found for another such environment; None to find them by trying some steps.
         info_keys: entries of a step that rewards read besides goals.
         names: the environment's own names of observation, achieved and desired goal, where they differ.
 

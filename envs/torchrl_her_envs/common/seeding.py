@@ -69,7 +69,7 @@ def as_seeds(seed: int | Sequence[int]) -> list[int]:
     """Returns one or several seeds as a list.
 
     Raises:
-        TypeError: a seed that is not an integer.
+        TypeError: a seed is not an integer.
 
     Example:
         >>> as_seeds(3), as_seeds([3, 4])

@@ -32,7 +32,7 @@ _OUR_OPTIONS = (
 EPISODES = 8  # number of first states whose goals serve to try the environment's functions
 _TRIED_STEPS = 100
 _LIMIT_STEPS = 1_000  # random steps in which an environment may show its own time limit
-_LIMIT = 100  # steps of an episode, if no time limit shows
+_LIMIT = 100  # steps of an episode, if no time limit is found
 _HALVINGS = 30
 _COARSE = 0.05  # largest step of float32, relative to the standard deviation of a goal
 _NOISE = 1e-5  # standard deviation of an entry of goals, relative to the largest, below which it is noise
@@ -205,7 +205,7 @@ class Trial:
 
     Attributes:
         achieved, desired: [n, g] goals after each step.
-        reward: [n] of each step.
+        reward: [n], reward of each step.
         terminated, truncated: [n] of bool, whether the environment ended the episode there.
         success: [n] of bool, the value of ``info["is_success"]``; None if it was missing in all steps.
         infos: n infos, as the environment gave them.

@@ -335,8 +335,8 @@ class GymGoalEnv(GoalEnv, GymWrapper):
         """Returns the reward of an achieved goal when another was desired, by the environment's own rule.
 
         Args:
-            achieved_goal: [..., g].
-            desired_goal: [..., g], broadcast against it.
+            achieved_goal: [..., g], the achieved goals.
+            desired_goal: [..., g], broadcast against ``achieved_goal``.
             info: [...], with the entries ``info_keys`` if there are any, broadcast against the goals.
 
         Returns:

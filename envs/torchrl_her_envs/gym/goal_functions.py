@@ -49,7 +49,7 @@ class GoalFunction:
         function: maps (achieved goal, desired goal, info) to a number or bool.
         achieved: [M, g] goals to try it with. Some rows should be equal to those of ``desired`` and others
             not, and M should not be g, so that the two dimensions cannot be mistaken for each other.
-        desired: [M, g].
+        desired: [M, g], the desired goals to try it with.
         name: name of the function, for messages.
         info: entries [M, ...] of the infos to try it with.
 

@@ -63,7 +63,7 @@ class Layout:
 
     @property
     def places(self) -> dict[str, list[int]]:
-        """Positions in the row of each entry of a nested dictionary; empty for a vector."""
+        """The columns of a row that hold each entry of a nested dictionary; empty for a vector."""
         places, first = {}, 0
         for leaf in self._leaves:
             if leaf.path:

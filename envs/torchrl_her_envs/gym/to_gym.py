@@ -15,7 +15,7 @@ from torchrl_her_envs.throwing.rendering.render import render
 from torchrl_her_envs.throwing.rules import reward_of
 from torchrl_her_envs.throwing.tasks import WorldConfig, get_task
 
-Observation = dict[str, Any]  # arrays
+Observation = dict[str, Any]  # arrays by name
 
 KEYS = ("observation", "achieved_goal", "desired_goal")
 FPS = 25
@@ -32,8 +32,8 @@ class GoalRules:
         """Computes the reward of having achieved one goal when another was desired.
 
         Args:
-            achieved_goal: [..., 2].
-            desired_goal: [..., 2], broadcast against it.
+            achieved_goal: [..., 2], the achieved goals.
+            desired_goal: [..., 2], broadcast against ``achieved_goal``.
             info: not used.
 
         Returns:
@@ -126,7 +126,7 @@ class GymTask(GoalRules, gymnasium.Env[Observation, np.ndarray]):
         """Makes one step of 0.04 s.
 
         Raises:
-            ValueError: an action that is not finite.
+            ValueError: an action is not finite.
         """
         core = self._core
         core.advance(np.asarray(action, np.float32)[None])
@@ -151,7 +151,7 @@ class GymTask(GoalRules, gymnasium.Env[Observation, np.ndarray]):
         (state,) = self._core.show_state()  # a new array, which no other object shares
         return {
             "observation": state[:-2],
-            "achieved_goal": state[self._core.achieved_index].copy(),  # the observation has this memory, too
+            "achieved_goal": state[self._core.achieved_index].copy(),  # the observation shares this memory
             "desired_goal": state[-2:],
         }
 

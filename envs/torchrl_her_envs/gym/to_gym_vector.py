@@ -98,9 +98,8 @@ class GymVectorTask(GoalRules, VectorEnv[Observation, np.ndarray, np.ndarray]):
 
         Raises:
             ResetNeeded: a mask leaves out environments in the first reset.
-            TypeError: a seed that is not an integer.
-            ValueError: a seed that is out of range, seeds for only some of the environments, or a mask that
-                chooses none.
+            TypeError: a seed is not an integer.
+            ValueError: a seed is out of range, only some environments get seeds, or a mask chooses none.
         """
         mask = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs)), np.bool_)
         if mask.shape != (self.num_envs,) or not mask.any():
@@ -121,7 +120,7 @@ class GymVectorTask(GoalRules, VectorEnv[Observation, np.ndarray, np.ndarray]):
 
         Raises:
             ResetNeeded: an environment must be reset first.
-            ValueError: an action that is not finite.
+            ValueError: an action is not finite.
         """
         before = self._over
         if not self._seeded or (self.autoreset_mode is AutoresetMode.DISABLED and before.any()):

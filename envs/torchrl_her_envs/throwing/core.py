@@ -32,7 +32,7 @@ _HELD_FROM_THE_START = {"held": 1.0, "away": 0.0, "mixed": 0.5}
 
 
 class Shown(NamedTuple):
-    """Observed entries: ``state`` is the observation [N, ...] with the goal [N, 2] behind it.
+    """Observed entries: ``state`` is the observation [N, ...] followed by the goal [N, 2].
 
     Each entry is a new array, which the caller may keep or change.
     """
@@ -273,7 +273,7 @@ class ThrowingCore:
         return Shown(state, state[:, :-2].copy(), state[:, self.achieved_index].copy(), state[:, -2:].copy())
 
     def show_state(self) -> np.ndarray:
-        """Returns the observations with the desired goals behind them, as a new array [N, ...]."""
+        """Returns the observations followed by the desired goals, as a new array [N, ...]."""
         self._closed_shown[:] = self._closed
         if self._angles:
             cosines, sines = self._angles
@@ -298,7 +298,7 @@ class ThrowingCore:
         """Returns a bound on the speed of the grip, in meters a second."""
         if self.task.effector == "hand":
             return math.sqrt(2.0) * self.world.hand_speed
-        # each joint turns all links behind it
+        # each joint turns all links from it to the grip
         return self.world.joint_speed * self.world.arm_length * (self.effector.num_joints + 1) / 2
 
     def _make_ball_starts(self) -> GoalDistribution:

@@ -1,4 +1,4 @@
-"""The environment behind all eleven throwing and reaching tasks."""
+"""The environment of all eleven throwing and reaching tasks."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class ThrowingEnv(BatchedEnv):
     """N environments in which a hand or an arm reaches for a ball or throws it into a black hole.
 
     Keys: ``observation``, ``achieved_goal``, ``desired_goal`` (gymnasium's GoalEnv convention),
-    ``state`` (the observation with the desired goal behind it), ``action`` in [-1, 1] (speeds of
+    ``state`` (the observation followed by the desired goal), ``action`` in [-1, 1] (speeds of
     the joints, then the grip: above 0 it closes), ``reward`` (0 where the goal is achieved, -1
     elsewhere), ``terminated`` (the goal is achieved), ``truncated`` (the last step), ``done``.
 
@@ -67,7 +67,7 @@ class ThrowingEnv(BatchedEnv):
     Raises:
         ValueError: ``num_envs`` or ``num_links`` is below 1, ``threshold`` is not positive, ``dtype`` is not
             a floating-point type, or the task has a wall and ``world`` has too few substeps for it.
-        TypeError: a seed that is not an integer.
+        TypeError: a seed is not an integer.
 
     Example:
         >>> from torchrl_her_envs import make_env
@@ -227,7 +227,7 @@ class ThrowingEnv(BatchedEnv):
             Pictures [len(worlds), size, size, 3] of uint8; without the first dimension for one index.
 
         Raises:
-            ValueError: an index that is out of range, or a size that is too small.
+            ValueError: an index is out of range, or a size is too small.
         """
         return render(self, worlds, size=_PICTURE if size is None else size, trail=trail, caption=caption)
 

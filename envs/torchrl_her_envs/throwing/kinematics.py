@@ -18,7 +18,7 @@ def walk(angles: Sequence[Any], base: Sequence[Any], link: float) -> Iterator[tu
         link: length of a link.
 
     Yields:
-        n times x and y.
+        x and y of the end of each of the n links.
 
     Example:
         >>> import math

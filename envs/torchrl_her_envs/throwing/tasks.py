@@ -35,8 +35,8 @@ class WorldConfig:
     ``hand_speed`` (or ``joint_speed``).
 
     Raises:
-        ValueError: a length, speed, mass or number that is not positive and finite, a number of steps that is
-            not whole, a gravity that is not finite, a bounce outside [0, 1], or a friction below 0.
+        ValueError: a length, speed, mass or number is not positive and finite, a number of steps is not
+            whole, gravity is not finite, bounce is outside of [0, 1], or friction is below 0.
 
     Example:
         >>> world = WorldConfig()
@@ -61,7 +61,7 @@ class WorldConfig:
     hole_radius: float = 0.05  # screen; distance at which a ball is at the goal
     hand_goals: tuple[float, float, float, float] = (0.55, 0.2, 0.95, 0.8)  # screen: left, bottom, right, top
     arm_goals: tuple[float, float, float, float] = (0.72, 0.2, 0.95, 0.8)  # beyond the arm's reach
-    wall_x: float = 0.5  # screen
+    wall_x: float = 0.5  # screen: the wall's middle
     wall_height: float = 0.5  # screen
     wall_thickness: float = 0.02  # screen
     arm_base: tuple[float, float] = (0.33, 0.5)  # screen: thesis, appendix A

@@ -38,8 +38,8 @@ class ToyEnv(BatchedEnv):
     """N environments whose states are places on a lattice, and whose goals are such places too.
 
     Keys: ``observation`` (the place), ``achieved_goal`` (the place too; the last part of it in a
-    :class:`Chain` of stages), ``desired_goal``, ``state`` (the observation with the desired goal behind
-    it), ``action`` (a whole number), ``reward`` (0 where the goal is achieved, -1 elsewhere),
+    :class:`Chain` of stages), ``desired_goal``, ``state`` (the observation followed by the desired
+    goal), ``action`` (a whole number), ``reward`` (0 where the goal is achieved, -1 elsewhere),
     ``terminated`` (the goal is achieved), ``truncated`` (the last step, or an end that says nothing
     about the goal), ``done``.
 
@@ -54,8 +54,8 @@ class ToyEnv(BatchedEnv):
     Args:
         goals: distribution of the desired goals.
         places: number of places along each coordinate.
-        low: the first place as the agent sees it.
-        high: the last place as the agent sees it.
+        low: observed value of the first place.
+        high: observed value of the last place.
         num_actions: number of actions.
         max_steps: number of steps after which an episode is truncated.
         num_envs: N, the number of environments.

@@ -1,4 +1,4 @@
-"""The chain (thesis, appendix C)."""
+"""The chain environment (thesis, appendix C)."""
 
 from __future__ import annotations
 

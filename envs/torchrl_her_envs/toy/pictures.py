@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchrl_her_envs.common.rendering.colors import FAILURE, INK, MARGIN, SUCCESS, Color
 
-WIDTH = 300  # pixels of the width, by default
+WIDTH = 300  # default width in pixels
 _HEIGHT = 0.6  # height of a picture, as a fraction of its width
 _FINER = 2  # factor by which pictures are drawn larger, for smooth edges
 _MOST_CELLS = 400  # links of a chain up to which they are drawn one by one
@@ -29,7 +29,7 @@ class Sheet:
     """A sheet of paper, one unit wide, with the origin at its top left.
 
     Args:
-        width: in pixels.
+        width: width of the sheet, in pixels.
     """
 
     def __init__(self, width: int) -> None:

@@ -60,7 +60,7 @@ class Batch:
         return len(self.ids)
 
     def after(self, held: Batch) -> Batch:
-        """Returns the transitions that were held back, followed by these.
+        """Returns the transitions that were held back, followed by those of this batch.
 
         Raises:
             ValueError: the environments of both are distinguished by different properties.

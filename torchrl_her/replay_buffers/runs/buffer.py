@@ -37,7 +37,7 @@ def rows_of_run(buffer: ReplayBuffer, run: int = 0) -> TensorDictBase:
 
 
 def bounds_of_run(buffer: ReplayBuffer, run: int) -> tuple[int, int]:
-    """Returns the first row of a run's block in the storage, and the one behind its last row."""
+    """Returns the first row of a run's block in the storage, and one more than its last row."""
     _check(buffer, run)
     if runs_of(buffer) == 1:
         return 0, len(buffer.storage)

@@ -44,7 +44,7 @@ def count_rows(
     Args:
         chunk: Episodes of m runs.
         real, virtual: the transitions that are written for the chunk; None without virtual ones.
-        relabeled: m numbers of real transitions that got goals of their own episode.
+        relabeled: for each run, the number of real transitions that got goals of their own episode.
     """
     least = chunk.options.achieved_reward
     columns = {

@@ -36,7 +36,7 @@ class Piece(NamedTuple):
         return number.new_zeros(len(self.runs)).index_add_(0, self.position, number).tolist()
 
     def counts(self, index: Tensor, run: Tensor | None) -> list[int]:
-        """Counts some transitions for each of the m runs.
+        """Counts how many of the given transitions belong to each of the m runs.
 
         Args:
             index: [V] int64, positions of transitions of these episodes in a batch.

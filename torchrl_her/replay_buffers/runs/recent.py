@@ -119,5 +119,5 @@ def _last(before: Tensor | None, new: Tensor, size: int) -> Tensor | None:
         # New goals are ordered by environment, so the last ones would be from few environments only.
         return new[spread_evenly(len(new), size, new.device)]
     if before is None:
-        return new.clone()  # not a view of the whole batch
+        return new.clone()  # a view would keep the whole batch in memory
     return torch.cat((before[max(0, len(before) + len(new) - size) :].to(new), new))

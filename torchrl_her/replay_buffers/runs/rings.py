@@ -16,7 +16,7 @@ class Rings:
     The capacity of a block is passed with each call, because it is known only once there is a storage.
 
     Args:
-        runs: R.
+        runs: R, the number of independent runs.
 
     Attributes:
         cursors: for each run, the place within its block where the next row goes.
@@ -74,7 +74,7 @@ class Places:
     Args:
         run: [n] int64, the run of each row; None if there is only one.
         n: number of rows.
-        runs: R.
+        runs: R, the number of independent runs.
         device: device of the result.
 
     Example:
@@ -115,7 +115,7 @@ class Places:
         begins = [cursor - count for cursor, count in zip(cursors, self._written, strict=True)]
         lost = [max(0, count - capacity) for count in self._written]
         if run is None:
-            gone = place < lost[0]  # also -1, for rows that were not written at all
+            gone = place < lost[0]  # true also of -1, which marks rows not written
             return place.add(begins[0]).remainder_(capacity).masked_fill_(gone, -1)
         gone = place < place.new_tensor(lost)[run]
         rows = (place.new_tensor(begins)[run] + place).remainder_(capacity)

@@ -83,10 +83,10 @@ class RunsSampler(_BlockSampler):
     without transitions gets rows of the first run that has some.
 
     Args:
-        capacity: rows of each run's block.
+        capacity: number of rows in each run's block.
 
     Keyword Args:
-        runs: R.
+        runs: R, the number of independent runs.
         generators: R sources of random numbers, on the device; None for the buffer's (``buffer.set_rng``),
             with one run.
         device: device on which rows are drawn. The storage may be on another one.

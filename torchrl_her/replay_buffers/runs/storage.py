@@ -77,7 +77,7 @@ class PackedStorage(LazyTensorStorage):
         packed = self.packed
         if packed is None or not isinstance(index, Tensor) or index.dtype != torch.int64 or index.ndim != 1:
             return super().get(index)
-        # A full storage needs no check of the indices: there is no row behind the last one.
+        # A full storage needs no check of the indices: there is no row after the last one.
         length = self._len
         if length < self.max_size and len(index) and int(index.max()) >= length:
             return super().get(index)  # the parent class raises an error

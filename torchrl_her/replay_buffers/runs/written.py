@@ -46,7 +46,7 @@ class WrittenRows:
         return self.changes[key]
 
     def like(self, rows: TensorDictBase) -> WrittenRows:
-        """Returns these transitions with changes in the types and shapes of the collected entries.
+        """Returns these transitions, their changes cast to the types and shapes of the collected entries.
 
         Raises:
             ValueError: an entry cannot hold a value.

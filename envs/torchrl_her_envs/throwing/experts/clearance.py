@@ -15,7 +15,7 @@ _SLOP = 1e-3  # meters that a ball may sink into a side without bouncing: roundi
 
 
 def clears_ceiling(start: Tensor, velocity: Tensor, world: WorldConfig) -> Tensor:
-    """Returns whether the highest point of a flight is below the ceiling: [...] of bool.
+    """Returns a mask [...] of the flights whose highest point is below the ceiling.
 
     Example:
         >>> start, velocity = torch.tensor([0.0, 4.9]), torch.tensor([[0.0, 4.0], [0.0, 5.0]])
@@ -28,7 +28,7 @@ def clears_ceiling(start: Tensor, velocity: Tensor, world: WorldConfig) -> Tenso
 
 
 def clears_wall(start: Tensor, velocity: Tensor, world: WorldConfig) -> Tensor:
-    """Returns whether a flight to the right, from left of the wall, passes above it: [...] of bool.
+    """Returns a mask [...] of the flights that pass above the wall, all of which go right from left of it.
 
     A parabola that is above both upper corners is above all between them.
 
@@ -47,7 +47,7 @@ def clears_wall(start: Tensor, velocity: Tensor, world: WorldConfig) -> Tensor:
 
 
 def is_free(points: Tensor, world: WorldConfig, *, wall: bool) -> Tensor:
-    """Returns whether a ball at points [..., 2] touches nothing: [...] of bool.
+    """Returns a mask [...] of the points [..., 2] at which a ball touches nothing.
 
     Example:
         >>> points = torch.tensor([[3.0, 2.0], [3.0, 4.0], [0.1, 4.0]])  # in the wall, above it, in the side

@@ -1,4 +1,4 @@
-"""Inverse kinematics of a planar arm of two equal links. Pure functions, any batch shape."""
+"""Inverse kinematics of a planar arm of two equal links. Pure functions for any batch shape."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def two_link_angles(point: Tensor, base: Tensor, length: float) -> Tensor:
     """Computes the angles that bring the end of an arm to a point, or as near to it as the arm reaches.
 
     Args:
-        point: [..., 2].
+        point: [..., 2], where the arm should end.
         base: [2], position of the first joint.
         length: total length; each link has half of it.
 

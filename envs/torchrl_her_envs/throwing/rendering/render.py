@@ -57,7 +57,7 @@ def render(
         Pictures [len(worlds), size, size, 3] of uint8; without the first dimension for a single index.
 
     Raises:
-        ValueError: an index that is out of range, or a size that is too small.
+        ValueError: an index is out of range, or a size is too small.
 
     Example:
         >>> from torchrl_her_envs import make_env

@@ -74,7 +74,7 @@ def draw_fist(canvas: Canvas, center: Point) -> None:
 
 
 def draw_arm(canvas: Canvas, joints: Sequence[Point], *, closed: bool) -> None:
-    """Draws links with round joints on a base plate, and a red circle at the end: filled if closed."""
+    """Draws links with round joints on a base plate, and a red circle at the end, filled if closed."""
     _draw_base(canvas, joints[0])
     *elbows, end = joints
     for start, stop in zip(elbows, [*elbows[1:], _before(elbows[-1], end)], strict=True):
