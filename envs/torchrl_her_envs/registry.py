@@ -157,7 +157,7 @@ def make_env(name: str, *, num_envs: int = 1, seed: int | Sequence[int] = 0, **o
             :func:`~torchrl_her_envs.make_own_env`.
 
     Raises:
-        ValueError: an unknown task, an option that it does not take, or a value out of its range.
+        ValueError: the task is unknown or does not take an option, or a value is out of its range.
         ImportError: a package that the task needs is not installed.
 
     Example:

@@ -34,7 +34,7 @@ def candidates(strategy: Strategy, lengths: Tensor, horizon: int) -> Tensor:
         False wherever t or t' is padding.
 
     Raises:
-        ValueError: an unknown strategy, or one that leaves the episode.
+        ValueError: the strategy is unknown, or leaves the episode.
 
     Example:
         >>> candidates("future", torch.tensor(2), 3).int().tolist()

@@ -41,7 +41,7 @@ class RareGoals(GoalWeights):
         limit: a goal's weight is at most ``limit`` times the weight at median density, and at least that
             weight divided by ``limit``.
         memory: number of the newest goals that are remembered.
-        samples: number of these from which densities are estimated; they are spread evenly over the memory.
+        samples: number of remembered goals, spread evenly over the memory, that densities are estimated from.
 
     Attributes:
         goals: [n, g], the remembered goals, in no particular order; None if there are none.

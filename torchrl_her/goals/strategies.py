@@ -120,8 +120,8 @@ def candidate_range(strategy: Strategy, time: Tensor, lengths: Tensor) -> tuple[
         ``(first, end)``, [...] each: the candidates are ``first <= t' < end``.
 
     Raises:
-        ValueError: an unknown strategy, or a function of one's own that gives a transition no candidate,
-            or one outside of its episode.
+        ValueError: the strategy is unknown, or its function gives a transition no candidate, or one
+            outside of its episode.
 
     Example:
         >>> first, end = candidate_range("future", torch.tensor([0, 1]), torch.tensor(2))

@@ -20,13 +20,13 @@ namespace her {
 using real = REAL;
 
 #if defined(__AVX512F__)
-constexpr int kVectorBytes = 64, kAccumulators = 24;  // of 32 registers
+constexpr int kVectorBytes = 64, kAccumulators = 24;  // the processor has 32 registers
 #elif defined(__AVX__)
-constexpr int kVectorBytes = 32, kAccumulators = 12;  // of 16
+constexpr int kVectorBytes = 32, kAccumulators = 12;  // 16 registers
 #elif defined(__aarch64__)
-constexpr int kVectorBytes = 16, kAccumulators = 24;  // of 32
+constexpr int kVectorBytes = 16, kAccumulators = 24;  // 32 registers
 #else
-constexpr int kVectorBytes = 16, kAccumulators = 12;  // of 16
+constexpr int kVectorBytes = 16, kAccumulators = 12;  // 16 registers
 #endif
 constexpr int kLanes = kVectorBytes / sizeof(real);
 

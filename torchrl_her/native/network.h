@@ -51,7 +51,7 @@ inline Matrix matrix(Arena& arena, int rows, int columns) {
 enum Activation { kNone, kRelu, kTanh, kElu };
 enum Norm { kPlain, kLayerNorm, kBatchNorm };
 
-// A layer, as Python describes it. `joined` of its inputs enter the network here, behind the outputs of the layer before.
+// A layer, as Python describes it. `joined` of its inputs enter the network here, after the outputs of the layer before.
 // A layer with 0 inputs has no product: it normalizes the network's input.
 struct Layer {
     int inputs, outputs, joined, activation, norm;
@@ -122,8 +122,8 @@ class Network {
         return pass;
     }
 
-    // Computes the network's output. `joined` [rows, width], with a stride, goes behind the outputs of the layer
-    // before, or behind the network's input; it is null if nothing joins.
+    // Computes the network's output. `joined` [rows, width], with a stride, follows the outputs of the layer
+    // before, or the network's input; it is null if nothing joins.
     Matrix forward(Pass& pass, const real* joined = nullptr, long joined_row = 0) {
         const int rows = pass.values[0].rows;
         for (size_t i = 0; i < layers_.size(); ++i) {

@@ -56,7 +56,7 @@ namespace {
 
 const real kHalfLogTwoPi = real(0.91893853320467274178), kLogTwo = real(0.69314718055994530942);
 const real kMostTanh = 1 - (sizeof(real) == 4 ? real(1e-6) : real(1e-15));  // as TorchRL's TanhNormal
-const real kFreeArgument = 2, kLargestAction = real(1 - 1e-6);  // as in objectives/action_cost.py
+const real kFreeArgument = 2, kLargestAction = real(1 - 1e-6);  // as in objectives/actor_terms.py
 const real kLeastScale = -10, kGreatestScale = 2;  // of SAC, as in modules/stochastic_actor.py
 
 // Whether the actor draws actions from a distribution, with a temperature.

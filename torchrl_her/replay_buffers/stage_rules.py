@@ -41,7 +41,7 @@ def split_stages(
 
     Raises:
         KeyError: rows do not carry their stage.
-        ValueError: there is no such stage.
+        ValueError: an episode's stage has no rule.
     """
     if not stages:
         yield 0, rows, episodes, run

@@ -85,7 +85,7 @@ class BatchedEnv(GoalEnv):
 
         Args:
             achieved_goal: [..., g], as the agent sees it.
-            desired_goal: [..., g], broadcast against it.
+            desired_goal: [..., g], broadcast against ``achieved_goal``.
 
         Returns:
             Rewards [..., 1]: 0 where the goal is achieved, -1 elsewhere.

@@ -252,7 +252,7 @@ def choose_indices(count: int, worlds: int | Sequence[int] | None) -> list[int]:
         worlds: an index, several, or None for all.
 
     Raises:
-        ValueError: no index, or one that is out of range.
+        ValueError: there is no index, or one is out of range.
 
     Example:
         >>> choose_indices(3, None), choose_indices(3, 1)

@@ -266,7 +266,7 @@ def find_achieved_reward(
     Args:
         env: environment with a dense reward.
         layout: layout of its goals.
-        reward: its reward function.
+        reward: the environment's reward function.
         achieved, desired: [m, g] goals, most of which are not achieved.
 
     Returns:

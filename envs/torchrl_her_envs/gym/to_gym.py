@@ -75,7 +75,7 @@ class GymTask(GoalRules, gymnasium.Env[Observation, np.ndarray]):
         threshold: distance below which a goal is achieved, in observed coordinates; the task's own if None.
 
     Raises:
-        ValueError: an unknown task or render mode, a number below 1, or a threshold that is not positive.
+        ValueError: task or mode is unknown, a number is below 1, or the threshold is not positive.
 
     Example:
         >>> env = gymnasium.make("torchrl_her/HandThrow-v2")

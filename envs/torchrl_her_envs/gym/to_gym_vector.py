@@ -48,7 +48,7 @@ class GymVectorTask(GoalRules, VectorEnv[Observation, np.ndarray, np.ndarray]):
         options: ``world``, ``num_links`` and ``threshold``, as for ``GymTask``.
 
     Raises:
-        ValueError: an unknown task or mode, a number below 1, or a threshold that is not positive.
+        ValueError: task or mode is unknown, a number is below 1, or the threshold is not positive.
 
     Example:
         >>> import gymnasium

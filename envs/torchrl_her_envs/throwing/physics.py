@@ -109,7 +109,7 @@ class BallPhysics:
 
         Args:
             world: the index of its world.
-            ball: x, y and their velocities.
+            ball: x and y of the ball, then its velocity in both directions.
         """
         if ball == self._settled[:, world].tolist():
             return ball

@@ -67,7 +67,7 @@ class ToyEnv(BatchedEnv):
         worlds: the state of all environments.
 
     Raises:
-        ValueError: a number out of its range, or environments that cannot be shared out among the seeds.
+        ValueError: a number is out of its range, or environments cannot be shared out among the seeds.
     """
 
     name: ClassVar[str]  # name of the task

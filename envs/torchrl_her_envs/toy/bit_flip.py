@@ -35,7 +35,7 @@ class BitFlip(ToyEnv):
         seed: seed of all starts and goals; R seeds for R equal blocks of environments, each as if alone.
 
     Raises:
-        ValueError: an option out of its range, or environments that cannot be shared out among the seeds.
+        ValueError: an option is out of its range, or environments cannot be shared out among the seeds.
 
     Example:
         >>> env = BitFlip(4, useless_action=True, num_envs=3, seed=0)

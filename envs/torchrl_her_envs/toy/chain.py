@@ -44,7 +44,7 @@ class Chain(ToyEnv):
         seed: seed of all transitions; R seeds for R equal blocks of environments, each as if alone.
 
     Raises:
-        ValueError: an option out of its range, or environments that cannot be shared out among the seeds.
+        ValueError: an option is out of its range, or environments cannot be shared out among the seeds.
 
     Example:
         >>> from tensordict.nn import TensorDictModule

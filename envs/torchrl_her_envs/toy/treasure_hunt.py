@@ -33,7 +33,7 @@ class TreasureHunt(ToyEnv):
     The agent sees a place x as ``x / 50 - 1``.
 
     Raises:
-        ValueError: an option out of its range, or environments that cannot be shared out among the seeds.
+        ValueError: an option is out of its range, or environments cannot be shared out among the seeds.
 
     Example:
         >>> from tensordict.nn import TensorDictModule
