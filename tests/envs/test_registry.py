@@ -106,6 +106,7 @@ def test_options_reach_the_environment() -> None:
     assert make_env("bit_flip").bits == 15
     assert make_env("bit_flip", bits=4, useless_action=True).num_actions == 5
     assert make_env("treasure_hunt", step=20).max_steps == 5
+    assert make_env("chain").max_steps == 10
     chain = make_env("chain", length=6, stages=3)
     assert (chain.length, chain.forward_probability, len(chain.stages())) == (6, 1.0, 3)
     assert make_env("robot_v0", num_links=3, threshold=0.2, dtype="float64").action_spec.shape == (1, 4)

@@ -55,6 +55,11 @@ def _sync() -> dict[str, Any]:
     return _run(tagged())
 
 
+def _several() -> dict[str, Any]:
+    """Two gradient steps for each frame, in turn with collecting."""
+    return _run(tagged(epochs=1, epoch_frames=60, frames_per_update=0.5))
+
+
 def _async() -> dict[str, Any]:
     """Two gradient steps for each frame, of another learner, with options of exploration."""
     td3 = {"learner": "td3", "critics": 3, "target_critics": 2, "action_noise": 0.1}
@@ -220,6 +225,7 @@ def _killed() -> dict[str, Any]:
 
 JOBS = {
     "sync": _sync,
+    "several": _several,
     "stopped": _stopped,
     "async": _async,
     "weights": _weights,

@@ -35,7 +35,7 @@ pytestmark = pytest.mark.long
 
 @pytest.fixture(scope="module")
 def together() -> dict[str, Any]:
-    return results_of("sync", "stopped")
+    return results_of("sync", "several", "stopped")
 
 
 @pytest.fixture(scope="module")
@@ -113,11 +113,13 @@ def test_all_rows_are_right_where_each_process_goes_its_way(apart: dict[str, Any
         assert sum(shares.get(block, 0) for block in begun[run]) == FRAMES
 
 
-def test_several_gradient_steps_for_each_frame(apart: dict[str, Any]) -> None:
-    assert [row["updates"] for row in apart["async"]["table"]] == [
-        2 * epoch * FRAMES for epoch in (1, 2) for _ in range(RUNS)
-    ]
-    assert all(row["loss_qvalue"] > 0 for row in apart["async"]["table"])
+def test_several_gradient_steps_for_each_frame(together: dict[str, Any], apart: dict[str, Any]) -> None:
+    for table, frames, loss in (
+        (together["several"]["table"], [60], "loss_value"),
+        (apart["async"]["table"], [FRAMES, 2 * FRAMES], "loss_qvalue"),
+    ):
+        assert [row["updates"] for row in table] == [2 * count for count in frames for _ in range(RUNS)]
+        assert all(row[loss] > 0 for row in table)
 
 
 def test_a_seed_repeats_a_run_also_if_it_stops_between_epochs(together: dict[str, Any]) -> None:
