@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModuleBase, TensorDictSequential
-from torch import Tensor, nn
-from torchrl.data import Bounded, LazyTensorStorage, TensorDictReplayBuffer
+from tensordict.nn import TensorDictModuleBase
+from torch import nn
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import DeviceCastTransform
-from torchrl.objectives import LossModule
 
 from torchrl_her import (
     Curriculum,
@@ -31,12 +29,10 @@ from torchrl_her import (
     Trainer,
     ZeroPad,
     box_target,
-    load_checkpoint,
     make_actor,
     make_critic,
     make_ddpg_loss,
     make_target_updater,
-    save_checkpoint,
     success,
 )
 from torchrl_her.goals import (
@@ -55,16 +51,6 @@ from torchrl_her.modules import (
     NormalizedPolicy,
     PolicyAverage,
     RunningNorm,
-    make_q_actor,
-    make_stochastic_actor,
-)
-from torchrl_her.objectives import (
-    ActorTerms,
-    critic_value,
-    make_dqn_loss,
-    make_sac_loss,
-    make_td3_loss,
-    make_tqc_loss,
 )
 from torchrl_her.replay_buffers import PackedStorage, RunsPrioritizedSampler, RunsSampler, empty_run
 from torchrl_her.trainers import buffer_state_dict, load_buffer_state_dict
@@ -317,78 +303,9 @@ def test_normalization_and_averages(device: torch.device) -> None:
         check(parameter, device)
 
 
-def test_averages_of_runs_some_of_which_are_idle(device: torch.device) -> None:
-    policy = make_actor((4, 2), 3, runs=2).to(device)
-    average = PolicyAverage(policy, runs=2)
-    before = [own.clone() for own in average.module.parameters()]
-    for parameter in policy.parameters():
-        parameter.data += 1.0
-    average.follow(2, idle=[1])
-    assert average.steps.tolist() == [2, 0]
-    for own, was in zip(average.module.parameters(), before, strict=True):
-        check(own, device)
-        assert bool((own[0] > was[0]).all())
-        assert torch.equal(own[1], was[1])
-
-
 def networks() -> tuple[TensorDictModuleBase, TensorDictModuleBase]:
     shape = NetworkShape(norm="layer")
     return make_actor((4, 2), 3, shape=shape), make_critic((4, 2), 3, shape=shape)
-
-
-SPEC = Bounded(-1.0, 1.0, shape=(3,))
-
-
-def make_loss(name: str, generators: list[torch.Generator], device: torch.device) -> LossModule:
-    actor, critic = networks()
-    spec, terms = SPEC.to(device), ActorTerms(action_penalty=0.1)
-    if name == "ddpg":
-        return make_ddpg_loss(actor.to(device), critic.to(device), terms=terms)
-    if name == "td3":
-        return make_td3_loss(
-            actor.to(device), critic.to(device), action_spec=spec, generators=generators, terms=terms
-        )
-    stochastic = make_stochastic_actor((4, 2), spec, generators=generators).to(device)
-    if name == "sac":
-        return make_sac_loss(stochastic, critic.to(device))
-    if name == "redq":
-        critics = [networks()[1].to(device) for _ in range(4)]
-        return make_sac_loss(stochastic, critics, target_critics=2)
-    quantiles = make_critic((4, 2), 3, outputs=5).to(device)
-    return make_tqc_loss(stochastic, quantiles)
-
-
-@pytest.mark.parametrize("name", ["ddpg", "td3", "sac", "redq", "tqc"])
-def test_gradient_steps(name: str, device: torch.device, make_generator: Generators) -> None:
-    loss = make_loss(name, [make_generator(0)], device)
-    learner = LossLearner(
-        loss,
-        torch.optim.Adam(loss.parameters()),
-        make_target_updater(loss, tau=0.1, hard_interval=0),
-        max_grad_norm=1.0,
-    )
-    before = [parameter.detach().clone() for parameter in loss.parameters()]
-    rows = random_rows(64).to(device)
-    for value in learner.update(rows, 2).values():
-        assert bool(value.isfinite().all())
-    for parameter, old in zip(loss.parameters(), before, strict=True):
-        check(parameter, device)
-        assert not torch.equal(parameter, old)
-    check(rows["td_error"], device)
-    value = critic_value(loss, random_rows(4).to(device))
-    assert value is not None
-    check(value, device)
-
-
-def test_gradient_steps_of_dqn(device: torch.device) -> None:
-    actor, _ = make_q_actor((4, 2), 3)
-    loss = make_dqn_loss(actor.to(device))
-    rows = random_rows(32).set("action", torch.randint(3, (32,))).to(device)
-    learner = LossLearner(
-        loss, torch.optim.Adam(loss.parameters()), make_target_updater(loss, tau=0.1, hard_interval=0)
-    )
-    learner.update(rows)
-    check(rows["td_error"], device)
 
 
 def test_steps_on_a_device_are_those_of_the_cpu(device: torch.device) -> None:
@@ -481,17 +398,3 @@ def test_metrics(device: torch.device) -> None:
         final_distance(rollout),
     ):
         check(value, device)
-
-
-def test_checkpoints_move(device: torch.device, tmp_path: Path) -> None:
-    actor = make_actor((4, 2), 3).to(device)
-    save_checkpoint({"actor": actor.state_dict()}, tmp_path / "state.pt")
-    other = make_actor((4, 2), 3)
-    state: dict[str, Tensor] = load_checkpoint(tmp_path / "state.pt")["actor"]
-    for value in state.values():
-        check(value, CPU)
-    other.load_state_dict(state)
-    actor.load_state_dict(state)
-    rows = random_rows(4)
-    acted = TensorDictSequential(actor)(rows.to(device))["action"]
-    torch.testing.assert_close(acted.cpu(), other(rows.clone())["action"])

@@ -194,29 +194,7 @@ def test_a_window_shows_each_state(monkeypatch: pytest.MonkeyPatch) -> None:
 # Other libraries
 
 
-def test_stable_baselines_trains_with_hindsight() -> None:
-    sb3 = pytest.importorskip("stable_baselines3")
+def test_the_checker_of_stable_baselines3_finds_no_fault() -> None:
+    pytest.importorskip("stable_baselines3")
     checker = importlib.import_module("stable_baselines3.common.env_checker")
-    env = make("hand_reach")
-    checker.check_env(env.unwrapped)
-    model = sb3.SAC(
-        "MultiInputPolicy",
-        env,
-        replay_buffer_class=sb3.HerReplayBuffer,
-        replay_buffer_kwargs={"n_sampled_goal": 4, "goal_selection_strategy": "future"},
-        policy_kwargs={"net_arch": [32, 32]},
-        learning_starts=200,
-        train_freq=8,
-        gradient_steps=1,
-        batch_size=64,
-        seed=0,
-        device="cpu",
-    )
-    before = [parameter.clone() for parameter in model.actor.parameters()]
-    model.learn(2_000)
-    assert model.num_timesteps == 2_000
-    assert any(not torch.equal(old, new) for old, new in zip(before, model.actor.parameters(), strict=True))
-    rows = model.replay_buffer.sample(512)
-    gap = (rows.next_observations["achieved_goal"] - rows.next_observations["desired_goal"]).norm(dim=-1)
-    assert torch.equal(rows.rewards.flatten(), (gap < 0.06).float() - 1.0)
-    assert (rows.rewards == 0).float().mean() > 0.02  # virtual goals are among them
+    checker.check_env(make("hand_reach").unwrapped)

@@ -88,25 +88,6 @@ def test_seeds_that_are_not_given_are_drawn() -> None:
         many.reset(seed=[1, 2, 3, 4.5])
 
 
-@pytest.mark.parametrize("task", ["hand_v0", "hand_wall_v2", "robot_v2"])
-def test_each_environment_of_a_vector_does_what_it_does_alone(task: str) -> None:
-    seeds = [5, 9, 5, 70, 1]
-    many, rng = make_many(task, num_envs=5, autoreset_mode="SameStep"), np.random.default_rng(0)
-    actions = rng.uniform(-1, 1, (110, *many.action_space.shape)).astype(np.float32)
-    many.reset(seed=seeds)
-    path = [many.step(action) for action in actions]
-    for world, seed in enumerate(seeds):
-        alone = make(task)
-        alone.reset(seed=seed)
-        for action, (shown, reward, terminated, truncated, _) in zip(actions, path, strict=True):
-            own, *outcome, _ = alone.step(action[world])
-            assert outcome == [reward[world], terminated[world], truncated[world]]
-            if terminated[world] or truncated[world]:
-                own, _ = alone.reset()
-            for key, value in own.items():
-                np.testing.assert_allclose(value, shown[key][world], rtol=0, atol=1e-6)
-
-
 def test_what_was_returned_stays_as_it_is() -> None:
     for mode in MODES:
         many = make_many("hand_v0", num_envs=4, autoreset_mode=mode, max_episode_steps=3, threshold=0.5)

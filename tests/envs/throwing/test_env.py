@@ -311,19 +311,6 @@ def test_reward_is_0_within_the_threshold(name: str, threshold: float) -> None:
             assert env.compute_terminated(achieved, goal).tolist() == [[reward == 0.0]]
 
 
-def test_rewards_of_a_batch_are_those_of_single_goals() -> None:
-    env = make("hand_v1")
-    generator = torch.Generator().manual_seed(0)
-    achieved, desired = (torch.rand(6, 5, 2, generator=generator) * 0.3 for _ in range(2))
-    rewards = env.compute_reward(achieved, desired)
-    assert rewards.shape == (6, 5, 1)
-    assert rewards.dtype == torch.float32
-    assert set(rewards.flatten().tolist()) == {0.0, -1.0}
-    for i in range(6):
-        for j in range(5):
-            assert torch.equal(env.compute_reward(achieved[i, j], desired[i, j]), rewards[i, j])
-
-
 def test_rewards_broadcast() -> None:
     env = make("hand_v1")
     achieved = points([0.0, 0.0], [1.0, 0.0], [0.05, 0.05]).unsqueeze(1)

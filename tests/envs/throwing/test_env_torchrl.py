@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 from torchrl.collectors import Collector
-from torchrl.envs import DoubleToFloat, RewardSum, SerialEnv, StepCounter, TransformedEnv
+from torchrl.envs import DoubleToFloat, RewardSum, StepCounter, TransformedEnv
 from torchrl.envs.libs.gym import GymEnv
 from torchrl.envs.utils import RandomPolicy, check_env_specs
 
@@ -41,16 +41,6 @@ def test_specs_of_other_arms(name: str, links: int) -> None:
     check_env_specs(make_env(name, num_envs=2, num_links=links), seed=0)
 
 
-def test_a_rollout_goes_on_over_ends() -> None:
-    torch.manual_seed(0)
-    steps = make_env("robot_v1", num_envs=4, seed=1).rollout(120, break_when_any_done=False)
-    done, first = steps["next", "done"].squeeze(-1), steps["state"][:, 1:]
-    assert done.sum() >= 4 * 2
-    inside = ~done[:, :-1]
-    assert torch.equal(first[inside], steps["next", "state"][:, :-1][inside])
-    assert not torch.equal(first[~inside], steps["next", "state"][:, :-1][~inside])
-
-
 def test_a_collector_gets_whole_episodes() -> None:
     torch.manual_seed(0)
     env = make_env("hand_v2", num_envs=4, seed=1)
@@ -77,19 +67,6 @@ def test_transforms_go_around_it() -> None:
     after = steps["next"]
     assert torch.equal(after["step_count"] == 50, after["truncated"])
     assert torch.equal(after["episode_reward"][:, 9], after["reward"][:, :10].sum(1))
-
-
-def test_two_environments_side_by_side() -> None:
-    torch.manual_seed(0)
-    env = SerialEnv(2, lambda: make_env("hand_v1", num_envs=3))
-    try:
-        env.set_seed(0)
-        steps = env.rollout(60, break_when_any_done=False)
-    finally:
-        env.close()
-    assert steps.batch_size == (2, 3, 60)
-    assert not torch.equal(steps["state"][0, :, 0], steps["state"][1, :, 0])  # each gets a seed of its own
-    assert torch.equal(steps["next", "done"], steps["next", "terminated"] | steps["next", "truncated"])
 
 
 def test_the_environment_below_transforms_is_found() -> None:

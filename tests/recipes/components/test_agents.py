@@ -42,13 +42,6 @@ def test_an_option_of_ddpg_is_refused_where_auto_turns_out_to_be_dqn() -> None:
         learner_of(recipe, TaskEnvs.of(recipe).make(1, [0]))
 
 
-def test_the_weights_of_a_run_depend_on_its_own_seed_alone() -> None:
-    recipe = small(task="hand_v0", num_runs=2, seed=3)
-    both, alone = build(recipe).actor, build(small(task="hand_v0", seed=4)).actor
-    for stacked, own in zip(both.parameters(), alone.parameters(), strict=True):
-        assert torch.equal(stacked[1], own.view_as(stacked[1]))
-
-
 def test_a_learner_that_explores_by_itself_gets_no_epsilon_when_a_stage_begins(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

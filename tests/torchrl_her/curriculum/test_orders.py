@@ -115,15 +115,6 @@ def test_runs_have_progress_of_their_own() -> None:
     assert teacher.shares[1, 0] == teacher.shares[1, 1]
 
 
-def test_a_teacher_goes_on_from_its_state() -> None:
-    first, second = (TeacherStudent(THREE, generators=[torch.Generator()]) for _ in range(2))
-    first.record_episodes(torch.tensor([[9, 9, 9]]), torch.tensor([[9, 3, 0]]))
-    first.draw([3])
-    second.load_state_dict(first.state_dict())
-    assert torch.equal(first.shares, second.shares)
-    assert torch.equal(first.draw([50]), second.draw([50]))
-
-
 def test_bad_options() -> None:
     with pytest.raises(ValueError, match=r"uniform_share must be in \(0, 1\], got 0"):
         TeacherStudent(THREE, uniform_share=0)

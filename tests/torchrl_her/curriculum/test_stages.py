@@ -379,27 +379,6 @@ def inputs_of_stage(stage: int, rows: int) -> Tensor:
     return torch.cat((torch.randn(rows, stage + 2), torch.zeros(rows, 2 - stage)), -1)
 
 
-@pytest.mark.parametrize("alpha", [0.0, 0.1])
-@pytest.mark.parametrize("kind", ["actor", "critic"])
-def test_unused_weights_stay_as_they_are_until_their_stage(kind: str, alpha: float) -> None:
-    net = ActorNet(4, 1, runs=2) if kind == "actor" else CriticNet(4, 1, runs=2)
-    weight = prepare(net, make_three().first_inputs, alpha)
-    before = weight.detach().clone()
-    optimizer = torch.optim.Adam(net.parameters(), lr=1e-2)
-    for _ in range(5):
-        seen = torch.cat((inputs_of_stage(0, 8), inputs_of_stage(1, 8)))  # run 0 and run 1
-        out = net(seen) if kind == "actor" else net(seen, torch.randn(16, 1))
-        optimizer.zero_grad()
-        out.square().sum().backward()
-        assert (weight.grad[0, 2:] == 0).all()
-        assert (weight.grad[1, 3:] == 0).all()
-        optimizer.step()
-    assert torch.equal(weight[0, 2:], before[0, 2:])
-    assert torch.equal(weight[1, 3:], before[1, 3:])
-    assert (weight[0, :2] != before[0, :2]).any()
-    assert (weight[1, 2] != before[1, 2]).any()  # run 1's stage uses this input
-
-
 def test_new_inputs_change_no_output_at_the_change_of_stage() -> None:
     """With alpha = 0: the first inputs keep their values (b was the goal, and is b), all others are free."""
     for alpha, same in ((0.0, True), (1.0, False)):

@@ -11,7 +11,7 @@ import pytest
 import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from tensordict import TensorDict, TensorDictBase, unravel_key
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictSequential
 from torch import Tensor, nn
 from torchrl.collectors import Collector
@@ -39,7 +39,6 @@ from torchrl_her import (
     ZeroPad,
     make_actor,
 )
-from torchrl_her.curriculum.transforms import take_columns
 from torchrl_her_envs import make_env
 
 from ...forks import server
@@ -338,22 +337,6 @@ def test_rewards_agree_with_goal_reward_to_the_last_bit(
         assert torch.equal(after["terminated"][row], terminated)
 
 
-@settings(max_examples=50, deadline=None)
-@given(st.lists(st.integers(0, 2), min_size=1, max_size=4), st.integers(1, 3), st.integers(0, 2), st.data())
-def test_another_runs_stage_never_touches_a_run(
-    stages: list[int], worlds: int, other: int, data: st.DataObject
-) -> None:
-    runs = len(stages)
-    which = data.draw(st.integers(0, runs - 1))
-    changed = [other if run == which else stage for run, stage in enumerate(stages)]
-    actions = torch.linspace(0.0, 12.0, runs * worlds).tolist()
-    one, two = (act(wrap(TinyEnv((runs * worlds,)), *own), actions) for own in (stages, changed))
-    rest = torch.arange(runs * worlds) // worlds != which
-    assert (one[rest] == two[rest]).all()
-    alone = act(wrap(TinyEnv((runs * worlds,)), *[other] * runs), actions)  # by the path for one stage
-    assert (two[~rest] == alone[~rest]).all()
-
-
 # On the hand
 
 
@@ -644,11 +627,6 @@ def test_parts_that_do_not_belong_together_are_refused() -> None:
             ZeroPad(progress.curriculum, progress, run=run)
 
 
-def test_columns_of_blocks() -> None:
-    rows = torch.arange(12.0).view(4, 3)
-    assert take_columns(rows, torch.tensor([[2, 0], [1, 1]])).tolist() == [[2, 0], [5, 3], [7, 7], [10, 10]]
-
-
 # Downstream: hindsight in a stage
 
 
@@ -673,41 +651,6 @@ def collect_and_write(exclude: tuple[str, ...]) -> tuple[CurriculumProgress, lis
         buffer.extend(block)
     collector.shutdown()
     return progress, buffers
-
-
-def test_rows_of_a_stage_have_its_goals() -> None:
-    _, (reach, throw) = collect_and_write(("state", "input"))
-    for buffer, achieved in ((reach, slice(0, 2)), (throw, slice(5, 7))):
-        rows = buffer[:]
-        assert not {unravel_key(key) for key in rows.keys(True, True)} & {
-            "state",
-            "input",
-            ("next", "state"),
-            ("next", "input"),
-        }
-        assert torch.equal(rows["achieved_goal"], rows["observation"][:, achieved])
-        virtual = rows[rows["virtual"].squeeze(-1)]
-        reached = {tuple(goal) for goal in rows["next", "achieved_goal"].tolist()}
-        assert len(virtual) > 500
-        assert all(tuple(goal) in reached for goal in virtual["desired_goal"].tolist())
-    real = reach[:][~reach[:]["virtual"].squeeze(-1)]
-    floor = real["desired_goal"][:, 1]  # the ball's height
-    assert torch.equal(floor, floor[:1].expand_as(floor))
-    assert (reach[:]["observation"][:, 5:] == 0).all()
-
-
-def test_the_sampled_input_holds_the_virtual_goal() -> None:
-    progress, buffers = collect_and_write(("state", "input"))
-    for run, (buffer, n) in enumerate(zip(buffers, (5, 9), strict=True)):
-        buffer.append_transform(ZeroPad(progress.curriculum, progress, run=run))
-        sample = buffer.sample()
-        virtual = sample["virtual"].squeeze(-1)
-        assert virtual.any()
-        for part in (sample, sample["next"]):
-            assert torch.equal(part["input"][:, n : n + 2], part["desired_goal"])
-            assert torch.equal(part["input"][:, :n], part["observation"][:, :n])
-            assert (part["input"][:, n + 2 :] == 0).all()
-        assert torch.equal(sample["desired_goal"], sample["next", "desired_goal"])
 
 
 def test_an_input_that_was_stored_is_replaced() -> None:

@@ -253,19 +253,6 @@ def scattered(episodes: int, length: int = 20, *, seed: int = 0) -> Any:
     return batch
 
 
-def test_goals_are_written_as_their_weights_say() -> None:
-    grid = GoalGrid((0.0, 0.0), (1.0, 1.0), (2, 1))
-    batch = make_batch([[2]] * 2_000)
-    path = torch.tensor([[0.5, 0.5], [0.1, 0.5], [0.9, 0.5]])  # a goal in each half
-    batch["achieved_goal"][:], batch["next", "achieved_goal"][:] = path[:-1], path[1:]
-    weights = Instructiveness(grid, quarters, sigma=0.2)
-    buffer = make_buffer(weights, strategy="episode", k=4)
-    buffer.extend(batch)
-    share = (virtual_goals(buffer[:])[:, 0] > 0.5).float().mean()
-    assert float(share) == pytest.approx(0.75, abs=0.02)  # six standard deviations
-    assert weights.counts.tolist() == [int((1 - share) * 16_000 + 0.5), int(share * 16_000 + 0.5)]
-
-
 def test_ibs_writes_goals_nearer_to_the_target_than_her() -> None:
     her, sequential = GoalHistogram(SCREEN), Instructiveness(SCREEN, RIGHT, sigma=0.2, subtract=False)
     ibs = Instructiveness(SCREEN, RIGHT, sigma=0.2)
@@ -283,31 +270,6 @@ def test_ibs_writes_goals_nearer_to_the_target_than_her() -> None:
     assert share[0] < share[1] < share[2]
     assert ibs.divergence < sequential.divergence < her.divergence_to(RIGHT(0.2))
     assert ibs.divergence < 0.5 * her.divergence_to(RIGHT(0.2))
-
-
-def test_a_goal_that_moves_nowhere_and_starts_in_the_box_does_not_crowd_out_the_others() -> None:
-    weights = Instructiveness(SCREEN, RIGHT, sigma=0.2)
-    buffer = make_buffer(weights)
-    batch = scattered(100)
-    batch["achieved_goal"][::2], batch["next", "achieved_goal"][::2] = 0.75, 0.75
-    for _ in range(3):
-        buffer.extend(batch)
-    assert float(weights(torch.tensor([0.75, 0.75]))) == pytest.approx(0.002 * float(weights.q_star.max()))
-    # Nothing else was on offer: the floor lets it in.
-    assert len(virtual_goals(buffer[:])) == 3 * 100 * 20 * 4
-
-
-def test_the_writer_carries_q_and_sigma() -> None:
-    first, second = (make_buffer(Instructiveness(SCREEN, RIGHT, sigma=0.2)) for _ in range(2))
-    first.extend(scattered(20))
-    first.writer.weights.step()
-    second.writer.load_state_dict(through_a_file(first.writer.state_dict()))
-    assert torch.equal(second.writer.weights.counts, first.writer.weights.counts)
-    assert second.writer.weights.sigma == first.writer.weights.sigma
-    for buffer in (first, second):
-        buffer.set_rng(torch.Generator().manual_seed(5))
-        buffer.extend(scattered(20, seed=1))
-    assert torch.equal(second.writer.weights.q, first.writer.weights.q)
 
 
 # Several runs at once

@@ -23,7 +23,7 @@ from torchrl_her.curriculum import set_stage_goals
 from torchrl_her.goals import KernelInstructiveness
 from torchrl_her.trainers import load_checkpoint, save_checkpoint
 
-from ..her_data import make_batch, make_buffer, virtual_goals
+from ..her_data import make_buffer
 
 PAIR = torch.tensor([[0.0], [2.0]])
 
@@ -236,41 +236,6 @@ def test_bad_options_are_named(goals: Tensor, options: dict[str, Any], message: 
 
 
 # In the writer
-
-
-def in_15_dimensions(episodes: int, *, seed: int) -> Any:
-    """Episodes of a hand, whose fifteen coordinates go anywhere in the box from 0 to 1 together, roughly."""
-    batch = make_batch([[20]] * episodes)
-    generator = torch.Generator().manual_seed(seed)
-    where = torch.rand(episodes, 21, 1, generator=generator).square()  # more often at the low end
-    path = where + 0.1 * torch.randn(episodes, 21, 15, generator=generator)
-    for part, own in ((batch, path[:, :-1]), (batch["next"], path[:, 1:])):
-        part["achieved_goal"] = own.clone()
-        part["desired_goal"] = torch.full_like(own, 0.8)
-    return batch
-
-
-def test_the_writer_prefers_goals_near_the_real_ones_in_15_dimensions() -> None:
-    real = 0.8 + 0.1 * torch.randn(500, 15, generator=torch.Generator().manual_seed(0))
-    judge = KernelInstructiveness(real, sigma=0.2)
-    shares, divergences = [], []
-    for subtract in (None, False, True):
-        weights = None if subtract is None else KernelInstructiveness(real, sigma=0.2, subtract=subtract)
-        buffer = make_buffer(weights)
-        for epoch in range(8):
-            buffer.extend(in_15_dimensions(50, seed=epoch))
-            if weights is not None:
-                weights.step()
-        goals = virtual_goals(buffer[:])
-        shares.append(float(((goals.mean(-1) - 0.8).abs() < 0.15).float().mean()))
-        judge.clear()
-        judge.update(goals)
-        divergences.append(judge.divergence)
-        if weights is not None:
-            assert weights.written == len(goals) == 8 * 50 * 20 * 4
-    assert shares[0] < 0.2
-    assert min(shares[1:]) > 2.0 * shares[0]
-    assert max(divergences[1:]) < 0.7 * divergences[0]
 
 
 def make_stage(*, instructive: bool) -> CurriculumStage:

@@ -11,12 +11,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
-from torchrl_her import GoalReward, GoalWeights, HERSampleUnit, HERWriter
+from torchrl_her import GoalWeights
 from torchrl_her.goals import NetworkNovelty, RareGoals
 from torchrl_her.goals.weights import spread_evenly
-from torchrl_her.replay_buffers import RunsSampler
 from torchrl_her.trainers import load_checkpoint, save_checkpoint
 
 from ..her_data import make_batch, make_buffer, virtual_goals
@@ -250,40 +248,3 @@ def test_rare_goals_are_written_more_often(make: Callable[[], GoalWeights]) -> N
         shares.append(share_of_rare(virtual_goals(late)))
     assert shares[0] == pytest.approx(0.1, abs=0.02)
     assert shares[1] > 1.5 * shares[0]
-
-
-def test_rare_goals_are_sampled_more_often() -> None:
-    shares = []
-    for weights in (None, RareGoals()):
-        unit = HERSampleUnit(
-            GoalReward(0.01), strategy="episode", weights=weights, generator=torch.Generator().manual_seed(0)
-        )
-        buffer = TensorDictReplayBuffer(
-            storage=LazyTensorStorage(1_000), batch_size=256, sample_unit=unit, transform=unit.relabel
-        )
-        buffer.extend(corners(20).reshape(-1).exclude("state"))
-        sampled = torch.cat([buffer.sample() for _ in range(10)])
-        shares.append(share_of_rare(virtual_goals(sampled)))
-    assert shares[1] > 2.0 * shares[0]
-
-
-def test_each_of_several_runs_has_a_memory_of_its_own() -> None:
-    own = [RareGoals(), RareGoals()]
-    generators = [torch.Generator().manual_seed(run) for run in range(2)]
-    writer = HERWriter(GoalReward(0.01), strategy="episode", weights=own, runs=2, generators=generators)
-    sampler = RunsSampler(5_000, runs=2, generators=generators)
-    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(10_000), writer=writer, sampler=sampler)
-    batch = corners(8)
-    batch["next", "achieved_goal"][4:] += 50.0
-    batch["achieved_goal"][4:] += 50.0
-    for _ in range(2):
-        buffer.extend(batch)
-    first, second = (weights.goals for weights in own)
-    assert first is not None
-    assert second is not None
-    assert len(first) == len(second) == 2 * 4 * 10 * 4
-    assert float(first.max()) < 10.0 < float(second.min())
-    single = make_buffer(RareGoals(), strategy="episode")
-    for _ in range(2):
-        single.extend(batch[:4])
-    torch.testing.assert_close(single.writer.weights.goals, first)

@@ -60,19 +60,23 @@ def csv_steps(path: Path) -> list[int]:
 
 @pytest.fixture(name="finished", scope="module")
 def _finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run with two loggers."""
+    """A run with a logger of its recipe and two of the user's."""
     folder = tmp_path_factory.mktemp("finished")
     recipe = small(epochs=2, num_runs=2, log=["tensorboard"], pictures=True)
-    run(build(recipe), folder, callbacks=[LogTo(CSVLogger("csv", str(folder)))], progress=False)
+    given = CSVLogger("csv", str(folder)), TensorboardLogger("events", str(folder))
+    run(build(recipe), folder, callbacks=[LogTo(own) for own in given], progress=False)
+    assert given[1].is_alive  # it is the user's to close
+    given[1].close()
     return folder
 
 
 def test_each_logger_has_each_row(finished: Path) -> None:
     rows = (finished / "metrics.csv").read_text().splitlines()
     assert len(rows) == 5
-    own = events(finished / "tensorboard")
+    own, given = events(finished / "tensorboard"), events(finished / "events")
     for name in ("success/run_0", "success/run_1"):
-        assert [event.step for event in own.Scalars(name)] == [480, 960]
+        for logged in (own, given):
+            assert [event.step for event in logged.Scalars(name)] == [480, 960]
         assert csv_steps(finished / "csv" / "scalars" / f"{name}.csv") == [480, 960]
     assert "seed/run_0" not in own.Tags()["scalars"]
 
@@ -88,6 +92,7 @@ def test_options_are_told(finished: Path) -> None:
 def test_pictures_and_the_film_are_shown_to_those_that_can(finished: Path) -> None:
     own = events(finished / "tensorboard")
     assert sorted(own.Tags()["images"]) == ["curves", "policy", "virtual_goals"]
+    assert "policy" in events(finished / "events").Tags()["images"]
     (film,) = own.Images("policy")
     assert film.step == 960
     assert film.encoded_image_string == (finished / "policy.gif").read_bytes()
@@ -113,18 +118,6 @@ def test_a_logger_that_joins_later_is_told_the_whole_table(tmp_path: Path) -> No
     resume(tmp_path, options={"epochs": 3, "log": ["tensorboard"]}, progress=False)
     steps = [event.step for event in events(tmp_path / "tensorboard").Scalars("epoch/run_0")]
     assert steps == [480, 960, 1_440]
-
-
-def test_any_logger_of_torchrl_can_be_given(tmp_path: Path) -> None:
-    loggers = [CSVLogger("mine", str(tmp_path)), TensorboardLogger("events", str(tmp_path))]
-    recipe = small(epochs=2, log=[], pictures=True)
-    run(build(recipe), tmp_path / "run", callbacks=[LogTo(own) for own in loggers], progress=False)
-    assert csv_steps(tmp_path / "mine" / "scalars" / "success" / "run_0.csv") == [480, 960]
-    own = events(tmp_path / "events")
-    assert [event.step for event in own.Scalars("success/run_0")] == [480, 960]
-    assert "policy" in own.Tags()["images"]
-    assert loggers[1].is_alive  # it is the user's to close
-    loggers[1].close()
 
 
 def test_rows_that_a_logger_has_are_left_out(tmp_path: Path) -> None:
