@@ -1,10 +1,10 @@
 """Filtered-HER with a curriculum (CHER) in one file: a hand picks a ball up and throws it into a hole.
 
-    python recipes/one_file_cher.py --seed 0    # about a minute; 96 to 100 % at the end
+    python recipes/one_file_cher.py --seed 0    # takes about a minute; success of 96 to 100 % at the end
 
-The file has all that a run needs, and uses only parts of the library: the environment in its stage, the
-writer that relabels, the networks, the loop of collection and gradient steps, and the change of stage.
-The package ``torchrl_her_recipes`` adds options, several runs at once, checkpoints and reports.
+This file contains a complete run: environments for each stage, the writer that relabels, networks, the loop
+of collection and gradient steps, and the change of stage. It uses only the library and its tasks. The package
+``torchrl_her_recipes`` adds options, several runs at once, checkpoints and reports.
 
 Filtered-HER and CHER: Manela, Deep Reinforcement Learning for Complex Manipulation Tasks with Sparse
 Feedback, 2020, algorithms 10 and 14. HER: Andrychowicz et al., 2017 (arXiv 1707.01495). DDPG: Lillicrap et
@@ -52,7 +52,7 @@ from torchrl_her_envs import make_env
 
 @dataclass(frozen=True)
 class Options:
-    """Settings of a run; frames are environment steps."""
+    """Options of a run; frames are environment steps."""
 
     seed: int = 0
     epochs: int = 30
@@ -63,13 +63,13 @@ class Options:
     warmup_frames: int = 3_200
     episodes: int = 100  # episodes of an evaluation
     # Hindsight
-    k: int = 4  # virtual goals of a transition
-    capacity: int = 1_000_000  # real and virtual transitions
+    k: int = 4  # virtual goals per transition
+    capacity: int = 1_000_000  # number of real and virtual transitions in the replay buffer
     priority_alpha: float = 0.3  # exponent of the squared TD error: equals 0.6 in Schaul et al.
     priority_beta: float = 0.4
     # Curriculum
-    window: int = 20  # greedy episodes whose mean success ends a stage
-    success_threshold: float = 0.9
+    window: int = 20  # greedy episodes whose mean success is compared with success_threshold
+    success_threshold: float = 0.9  # mean success at which a stage ends
     # DDPG
     hidden: int = 64
     batch_size: int = 256
@@ -78,15 +78,15 @@ class Options:
     tau: float = 0.02
     action_penalty: float = 0.3  # keeps the actor's tanh from its ends, where the gradient vanishes
     max_grad_norm: float = 3.0
-    ema_decay: float = 0.9995  # decay of the average of weights that is evaluated
-    # Exploration: of a share epsilon of the actions, a fifth is uniform, and the others have noise
-    epsilon_decay: float = 0.9  # factor of epsilon after each epoch
+    ema_decay: float = 0.9995  # decay of the moving average of weights, which is evaluated
+    # Exploration: a fraction epsilon of the actions explores; a fifth of these are uniform, the others noisy
+    epsilon_decay: float = 0.9  # factor by which epsilon shrinks after each epoch
     epsilon_end: float = 0.05
     noise: float = 0.05
 
 
 class Evaluation(NamedTuple):
-    """Result of an epoch: the stage that was trained, and its success in greedy episodes."""
+    """Result of an epoch: frames so far, the stage that was trained, and its success in greedy episodes."""
 
     frames: int
     stage: str
@@ -94,7 +94,7 @@ class Evaluation(NamedTuple):
 
 
 def make_stages() -> CurriculumProgress:
-    """Returns the stages of ``hand_v1``, reach and throw, and the record of successes that ends a stage."""
+    """Returns the progress through the stages of ``hand_v1`` (reach, then throw), at the first stage."""
     task = make_env("hand_v1")
     width = task.observation_spec["state"].shape[-1]
     stages = [CurriculumStage(**stage) for stage in task.stages()]
@@ -102,10 +102,11 @@ def make_stages() -> CurriculumProgress:
 
 
 def make_staged_env(progress: CurriculumProgress, num_envs: int, seed: int) -> EnvBase:
-    """Returns environments that show the observation and goals of the present stage.
+    """Makes environments that show the observation and goals of the current stage.
 
-    ``StateToObs`` reads observation and goals from the state, and rewards the stage's goal. ``ZeroPad``
-    writes ``input``, where an entry has the same place in all stages; unused entries are 0.
+    ``StateToObs`` reads observation and goals from the state, and rewards achieving the stage's goal.
+    ``ZeroPad`` writes the networks' ``input``, in which each entry of the state has the same place in all
+    stages, and entries that the stage does not use are 0.
     """
     stages = StateToObs(progress.curriculum, progress), ZeroPad(progress.curriculum, progress)
     return TransformedEnv(make_env("hand_v1", num_envs=num_envs, seed=seed), Compose(*stages))
@@ -114,7 +115,7 @@ def make_staged_env(progress: CurriculumProgress, num_envs: int, seed: int) -> E
 def make_network(
     make: Callable[..., TensorDictModule], curriculum: Curriculum, hidden: int
 ) -> TensorDictModule:
-    """Returns an actor or a critic. If the first stage does not use an input, its weights begin at 0."""
+    """Makes an actor or a critic; initial weights of inputs that the first stage does not use are 0."""
     shape = NetworkShape(hidden=hidden, norm="layer")
     network = make([curriculum.input_width], 3, shape=shape, in_keys=["input"])
     first = next(module for module in network.modules() if isinstance(module, StackedLinear))
@@ -123,7 +124,7 @@ def make_network(
 
 
 def make_buffer(options: Options, progress: CurriculumProgress) -> TensorDictReplayBuffer:
-    """Returns a replay buffer that relabels written transitions and prefers those with a large TD error."""
+    """Makes a prioritized replay buffer that relabels transitions when they are written."""
     buffer = TensorDictReplayBuffer(
         storage=LazyTensorStorage(options.capacity),
         sampler=PrioritizedSampler(
@@ -133,12 +134,13 @@ def make_buffer(options: Options, progress: CurriculumProgress) -> TensorDictRep
             progress.stage_of(0).reward_fn or GoalReward(0.1),
             k=options.k,
             strategy="future",
-            filter_achieved=True,  # leaves out goals that were achieved before the action
+            filter_achieved=True,  # leaves out virtual goals that were achieved before the action
             exclude=("state", "input"),
         ),
         priority_key="td_error",
     )
-    buffer.append_transform(ZeroPad(progress.curriculum, progress))  # ``input`` contains the virtual goal
+    # ``input`` contains the goal, so it must be computed after relabeling.
+    buffer.append_transform(ZeroPad(progress.curriculum, progress))
     return buffer
 
 
@@ -182,7 +184,7 @@ def train(options: Options) -> Iterator[Evaluation]:
     for epoch in range(1, options.epochs + 1):
         while frames < epoch * options.epoch_frames:
             batch = collector.next()
-            buffer.extend(batch)  # writes ended episodes: each transition with its own goal and with k others
+            buffer.extend(batch)  # writes finished episodes: each transition with its own and k virtual goals
             frames += batch.numel()
             if frames < options.warmup_frames:
                 updates = frames // options.frames_per_update
@@ -190,7 +192,7 @@ def train(options: Options) -> Iterator[Evaluation]:
             steps = frames // options.frames_per_update - updates
             if len(buffer) > 0 and steps > 0:
                 rows = buffer.sample(steps * options.batch_size)
-                learner.update(rows, steps)  # gradient steps, each with its own ``batch_size`` rows
+                learner.update(rows, steps)  # ``steps`` gradient steps, each with ``batch_size`` of the rows
                 average.follow(steps)
                 buffer.update_tensordict_priority(rows)
             updates += steps
@@ -199,7 +201,7 @@ def train(options: Options) -> Iterator[Evaluation]:
         yield Evaluation(frames, progress.stage_of(0).name, float(achieved.mean()))
         if progress.record(achieved.view(1, -1))[
             0
-        ]:  # the window's mean is high enough: the next stage begins
+        ]:  # mean success in the window has reached the threshold: the next stage begins
             enter_stage(buffer, progress.stage_of(0), exploration)
             collector.reset()
             buffer.writer.end_episodes()

@@ -1,7 +1,7 @@
-"""Recipes: whole training runs composed of the library and the tasks.
+"""Recipes: complete training runs, composed of the library and its tasks.
 
-The names, listed in ``__init__.pyi``, are loaded when they are first used, so that a list of tasks does not
-import torch.
+Public names (listed in ``__init__.pyi``) are loaded at their first use, so that commands such as
+``torchrl-her list`` start without importing torch.
 """
 
 import lazy_loader

@@ -124,7 +124,7 @@ def test_every_preset_runs(preset: Path) -> None:
         ("train --dry", "No such option '--dry'\n"),
         ("train --folde x", "No such option '--folde'. Did you mean '--folder'?"),
         ("train frames=1000 epochs=3", "epochs=3 and frames=1000 say the same: give one of them"),
-        ("train strategy=mine", "one of your own must be registered by a module, as in torchrl-her --import"),
+        ("train strategy=mine", "to use your own, import the module that registers it: torchrl-her --import"),
         ("train --resume", "Option '--resume' requires an argument"),
         ("play hand_v0 --goals 0", "0 is not in the range x>=1"),
         ("play hand_v0 --out x.png", "its suffix must be one of .gif, .mp4"),

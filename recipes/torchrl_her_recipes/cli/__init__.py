@@ -1,4 +1,4 @@
-"""The command line. Commands and their arguments are checked before torch is imported."""
+"""The command line ``torchrl-her``. Arguments are checked before torch is imported, to fail fast."""
 
 from torchrl_her_recipes.cli.group import main
 

@@ -1,4 +1,4 @@
-"""``torchrl-her check``: facts about a task from random actions, before anything is trained."""
+"""``torchrl-her check``: plays random actions on a task and prints facts and advice before training."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 import yaml
 
-import torchrl_her_recipes as recipes  # its names are loaded when they are used: torch comes with them
+import torchrl_her_recipes as recipes  # imports torch only when one of its names is used
 from torchrl_her_recipes.cli.say import file_name
 from torchrl_her_recipes.cli.train_options import OptionsCommand, complete, requests
 
@@ -18,8 +18,8 @@ from torchrl_her_recipes.cli.train_options import OptionsCommand, complete, requ
 def check(options: tuple[str, ...], steps: int) -> int:
     """Play random actions on a task; for instance: torchrl-her check task=gym:FetchPush-v4
 
-    Options are those of `torchrl-her train`. Nothing is trained. In half a minute, prints what hindsight can
-    learn from, and suggests options.
+    Prints, within half a minute, what hindsight can learn from, and suggests options. Trains nothing. Takes
+    the options of `torchrl-her train`.
     """
     (recipe,) = requests(options, multirun=False).values()
     facts = recipes.look_at(recipe, steps=steps)

@@ -1,4 +1,4 @@
-"""``torchrl-her``: the group of commands, and how each of them ends."""
+"""``torchrl-her``: the group of all commands, which turns their errors into messages and exit codes."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _SETTINGS = {"help_option_names": ["-h", "--help"], "max_content_width": 110}
 
 
 class _Commands(click.Group):
-    """Group that suggests the nearest command for an unknown one; ``folder=DIR`` is ``--folder DIR``."""
+    """Group that suggests similar names for an unknown command, and reads ``folder=DIR`` as ``--folder``."""
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
@@ -50,14 +50,14 @@ class _Commands(click.Group):
         return name, command, rest
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        return list(self.commands)  # in the order of use, not alphabetically
+        return list(self.commands)  # in the order in which they are typically used, not alphabetically
 
 
 def _import(context: click.Context, _parameter: click.Parameter, modules: tuple[str, ...]) -> None:
     try:
         import_modules(modules)
     except ValueError:
-        if not context.resilient_parsing:  # while the shell completes a command, errors must not end it
+        if not context.resilient_parsing:  # errors must not break the shell's completion of a command
             raise
 
 
@@ -69,11 +69,11 @@ def _import(context: click.Context, _parameter: click.Parameter, modules: tuple[
     multiple=True,
     expose_value=False,
     callback=_import,
-    help="import a module first, whose registered names can then be used; may be repeated",
+    help="first import a module, so that names it registers can be used; may be repeated",
 )
 @click.pass_context
 def group(context: click.Context) -> None:
-    """Train, compare and show policies that learn from sparse rewards with hindsight.
+    """Train, compare and show policies that learn from sparse rewards by hindsight experience replay.
 
     Shell completion: eval "$(_TORCHRL_HER_COMPLETE=bash_source torchrl-her)" (or zsh_source, fish_source).
     """
@@ -92,7 +92,7 @@ _may_import = click.option(
     is_flag=True,
     expose_value=False,
     callback=_permit,
-    help="import the module that a task in a file names (module:function, gym:module:ID), if you trust it",
+    help="allow modules to be imported that a file names by its task (module:function, gym:module:ID)",
 )
 
 for _command in (check, train, record, play, export, plot, study, report, tune):
@@ -101,7 +101,7 @@ group.add_command(listing)
 
 
 class _Notices(logging.Handler):
-    """Log handler that prints each notice of an environment in one line, as warnings are printed."""
+    """Log handler that prints each message of an environment in one line, like a warning."""
 
     def emit(self, record: logging.LogRecord) -> None:
         say_line(("warning: " if record.levelno >= logging.WARNING else "") + record.getMessage())

@@ -1,4 +1,4 @@
-"""``torchrl-her list``: all names that the other commands take."""
+"""``torchrl-her list``: prints all names that the other commands accept."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from torchrl_her_recipes.config.study import load_study, study_names
 
 @click.command("list", short_help="tasks, algorithms, choices of options, studies, policies, spaces, presets")
 def listing() -> int:
-    """List what there is."""
+    """List all names that the other commands accept, with a summary of each."""
     sections = {
         "tasks": {name: get_task_spec(name).summary for name in task_names()}
         | {f"{GYM}ID": "any gymnasium environment with goals, by its id (gym:my_module:MyEnv-v0)"}

@@ -1,4 +1,4 @@
-"""``NAME=VALUE`` arguments of the command line: values as in YAML, and sweeps over several of them."""
+"""Parses ``NAME=VALUE`` arguments of the command line, whose values are YAML, or several for a sweep."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torchrl_her_recipes.config.plain_files import parse_yaml
 from torchrl_her_recipes.config.shipped import preset_names
 from torchrl_her_recipes.config.shortcuts import GROUPS, KINDS, locate, split_name
 
-ARGUMENTS = ("preset", "folder")  # arguments besides options; their values are always names
+ARGUMENTS = ("preset", "folder")  # arguments that are not options; their values are never parsed as YAML
 _OPENING, _CLOSING = "[{(", "]})"
 
 
@@ -36,15 +36,15 @@ def parse_override(text: str) -> tuple[str, str]:
 
 
 def _path(name: str, value: str) -> tuple[str, ...]:
-    """Returns group, option and mapping entry that a name refers to."""
-    if name in ARGUMENTS or (name in GROUPS and value.startswith("{")):  # {...}: a whole group
+    """Returns group, option and, if given, mapping entry that a name refers to."""
+    if name in ARGUMENTS or (name in GROUPS and value.startswith("{")):  # {...} sets a whole group
         return (name,)
     option, *entry = split_name(name)
     return (*locate(option), *entry)
 
 
 def check_once(arguments: Sequence[tuple[str, str]]) -> None:
-    """Raises a ValueError for two values of one option.
+    """Raises a ValueError if arguments set an option twice, even under different names.
 
     Example:
         >>> check_once([("seed", "1"), ("run.seed", "2")])
@@ -62,7 +62,7 @@ def check_once(arguments: Sequence[tuple[str, str]]) -> None:
 
 
 def _meant(text: str) -> str:
-    """Returns a hint if an argument is a known name without its option, as a task without ``task=``."""
+    """Returns a hint if an argument is a known value without its option, as in ``hand_v0``; else ""."""
     for name, known in (
         ("task", task_names()),
         ("algo", ALGORITHMS),
@@ -75,7 +75,7 @@ def _meant(text: str) -> str:
 
 
 def parse_value(text: str) -> Any:
-    """Parses a value as YAML; None is written ``null``, or as in Python.
+    """Parses a value as YAML; ``null`` and ``None`` both give None.
 
     Example:
         >>> parse_value("3"), parse_value("{bits: 8}"), parse_value("gym:FetchReach-v4")
@@ -90,7 +90,7 @@ def parse_value(text: str) -> Any:
 
 
 def split_sweep(text: str) -> list[str]:
-    """Splits the values of a sweep at commas outside of brackets and quotes.
+    """Splits the values of a sweep at the commas that are outside of brackets and quotes.
 
     Example:
         >>> split_sweep("her,filtered_her"), split_sweep("{bits: 8, useless_action: true}")
@@ -111,7 +111,7 @@ def split_sweep(text: str) -> list[str]:
 
 
 def sweep(arguments: Sequence[tuple[str, str]]) -> Iterator[dict[str, Any]]:
-    """Returns all combinations of the values of a sweep, the last option varying fastest.
+    """Yields all combinations of the values in a sweep, as options by name; the last option varies fastest.
 
     Example:
         >>> list(sweep([("algo", "her,cher"), ("seed", "0,1")]))[1]

@@ -1,4 +1,4 @@
-"""``torchrl-her play`` and ``export``: show a policy in a video or window, and write it to a file."""
+"""``torchrl-her play`` shows a policy in a video or a window; ``torchrl-her export`` writes it to a file."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from typing import Literal
 import click
 from click.shell_completion import CompletionItem
 
-import torchrl_her_recipes as recipes  # its names are loaded when they are used: torch comes with `play`
+import torchrl_her_recipes as recipes  # imports torch only when one of its names is used
 from torchrl_her_recipes.cli.say import file_name
 from torchrl_her_recipes.config.shipped import find_policy, policy_files
 
 _SUFFIXES = (".gif", ".mp4")
 _RUN = click.Path(path_type=Path)
 _best = click.option(
-    "--best", is_flag=True, help="the policy of the evaluation with the best success, not the last one"
+    "--best", is_flag=True, help="use the policy of the evaluation with the best success, not the last one"
 )
 
 
@@ -24,7 +24,7 @@ def _complete(_context: click.Context, _parameter: click.Parameter, incomplete: 
     return [*names, CompletionItem(incomplete, type="file")]
 
 
-@click.command(short_help="film or show a policy: of a run, an exported one, or one of the package")
+@click.command(short_help="show the policy of a run, of a file or of the package, in a film or a window")
 @click.argument("source", metavar="RUN|FILE|TASK", shell_complete=_complete)
 @click.option("--window", is_flag=True, help="show it live in a window, with keys, instead of writing a film")
 @click.option(
@@ -33,15 +33,15 @@ def _complete(_context: click.Context, _parameter: click.Parameter, incomplete: 
     metavar="RUN|FILE|TASK",
     multiple=True,
     shell_complete=_complete,
-    help="another policy of the same task beside it, with the same starts and goals; may be repeated",
+    help="show another policy of the same task beside it, with the same starts and goals; may be repeated",
 )
-@click.option("--out", type=_RUN, help="the .gif or .mp4 (default: RUN/play.gif, FILE.gif or TASK.gif)")
+@click.option("--out", type=_RUN, help=".gif or .mp4 file (default: RUN/play.gif, FILE.gif or TASK.gif)")
 @click.option("--run", type=click.IntRange(0), help="index of the run in RUN (default: the median)")
 @_best
 @click.option("--goals", type=click.IntRange(1), help="episodes side by side (default: 6, in a window 1)")
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="seed of goals and starts")
 @click.option(
-    "--size", type=click.IntRange(32), help="pixels of one environment (default: 240, in a window 480)"
+    "--size", type=click.IntRange(32), help="pixels of each environment (default: 240, in a window 480)"
 )
 def play(
     source: str,
@@ -56,8 +56,8 @@ def play(
 ) -> int:
     """Show a policy: as a GIF or MP4, or live in a window.
 
-    RUN is the folder of a run, or the file of a policy in it, FILE a .safetensors that `torchrl-her export`
-    wrote, TASK one of the trained policies.
+    RUN is the folder of a run or a policy's file in this folder, FILE is a .safetensors file written by
+    `torchrl-her export`, and TASK is one of the trained policies of the package.
 
     Keys in the window: space pauses, n or the right arrow takes one step, r skips to the next goals, + and
     - change the speed, q or escape quits.
@@ -65,7 +65,7 @@ def play(
     sources = (source, *others)
     for name in sources:
         if not Path(name).is_dir():
-            find_policy(name)  # before torch is imported
+            find_policy(name)  # raises for an unknown policy, before torch is imported
     if window and out is not None:
         raise click.UsageError("--window and --out cannot be given together")
     film = None if window else out or _film_of(Path(source), compared=bool(others))
@@ -82,12 +82,12 @@ def play(
 
 
 def _film_of(source: Path, *, compared: bool) -> Path:
-    """Returns the path for a policy's video: in the folder of its run, or beside its file."""
+    """Returns the default path of a policy's video: in the folder of its run, or beside its file."""
     name = "compare.gif" if compared else "play.gif"
     if source.is_dir():
         return source / name
     if source == recipes.RunFolder(source.parent).policy and source.is_file():
-        return source.with_name(name)  # policy.gif is the video that the run itself made at its end
+        return source.with_name(name)  # not policy.gif, which is the video that the run made at its end
     stem = source.stem if source.is_file() else file_name(str(source))
     return source.with_name(f"{stem}{'_compare' * compared}.gif")
 
@@ -95,21 +95,21 @@ def _film_of(source: Path, *, compared: bool) -> Path:
 @click.command(short_help="write a run's policy to a small file, for load_policy or as ONNX")
 @click.argument("source", metavar="RUN|FILE|TASK", shell_complete=_complete)
 @click.option(
-    "--out", type=_RUN, help="the file (default: RUN/TASK.safetensors, FILE.onnx or TASK.safetensors)"
+    "--out", type=_RUN, help="file to write (default: RUN/TASK.safetensors, FILE.onnx or TASK.safetensors)"
 )
 @click.option(
     "--format",
     "form",
     type=click.Choice(["safetensors", "onnx"]),
-    help="safetensors: for load_policy; onnx: for onnxruntime (default: what --out ends with, or the first)",
+    help="safetensors, for load_policy; onnx, for onnxruntime (default: suffix of --out, or safetensors)",
 )
 @click.option("--run", "index", type=click.IntRange(0), help="index of the run in RUN (default: the median)")
-@click.option("--task", help="task of the policy, if not the run's own")
+@click.option("--task", help="task for which the policy is exported (default: the task of its run)")
 @click.option(
     "--card/--no-card",
     default=True,
     show_default=True,
-    help="write a page about the policy beside it, FILE.md",
+    help="also write a model card, a page FILE.md about the policy",
 )
 @_best
 def export(
@@ -123,8 +123,8 @@ def export(
 ) -> int:
     """Write a policy as a file: .safetensors for `torchrl-her play` and load_policy, .onnx for onnxruntime.
 
-    RUN is the folder of a run, or the file of a policy in it. FILE, which export wrote, or TASK, one of the
-    trained policies, can be written in another format.
+    RUN is the folder of a run or a policy's file in this folder. FILE, an exported policy, and TASK, one of
+    the trained policies of the package, can be written in another format.
     """
     file = out or _file_of(source, task, f".{form or 'safetensors'}")
     if form is not None and file.suffix != f".{form}":
@@ -136,7 +136,7 @@ def export(
 
 
 def _file_of(source: str, task: str | None, suffix: str) -> Path:
-    """Returns the default path for a policy: in the folder of its run, or beside its file."""
+    """Returns the default path of an exported policy: in the folder of its run, or beside its file."""
     path = Path(source)
     home = recipes.RunFolder.of(path)
     if home is not None:

@@ -6,20 +6,20 @@ from pathlib import Path
 
 import click
 
-import torchrl_her_recipes as recipes  # its names are loaded when they are used: torch comes with them
+import torchrl_her_recipes as recipes  # imports torch only when one of its names is used
 from torchrl_her_recipes.cli.say import file_name
 
 
 @click.command(short_help="record demonstrations of a task, for demonstrations.file=FILE")
 @click.argument("task", metavar="TASK")
 @click.option(
-    "--episodes", type=click.IntRange(1), default=100, show_default=True, help="episodes in the file"
+    "--episodes", type=click.IntRange(1), default=100, show_default=True, help="number of episodes to write"
 )
-@click.option("--out", type=click.Path(path_type=Path), help="the .pt file (default: TASK_demos.pt)")
+@click.option("--out", type=click.Path(path_type=Path), help=".pt file to write (default: TASK_demos.pt)")
 @click.option(
     "--policy",
     metavar="expert|FILE|NAME",
-    help="player: the scripted controller (default), an exported policy, or one of the package",
+    help="policy that plays: the scripted expert (default), an exported policy, or a policy of the package",
 )
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="seed of starts and goals")
 @click.option("--all", "keep_all", is_flag=True, help="write episodes that fail, too")
@@ -27,9 +27,9 @@ from torchrl_her_recipes.cli.say import file_name
 def record(
     task: str, episodes: int, out: Path | None, policy: str | None, seed: int, keep_all: bool, force: bool
 ) -> int:
-    """Play episodes of TASK and write those that achieve their goal.
+    """Play episodes of TASK and write those that achieve their goal to a file.
 
-    Training learns from them with demonstrations.file=FILE demonstrations.episodes=10.
+    To train with ten of them: torchrl-her train demonstrations.file=FILE demonstrations.episodes=10
     """
     file = out or Path(f"{file_name(task)}_demos.pt")
     recorded = recipes.record_demonstrations(

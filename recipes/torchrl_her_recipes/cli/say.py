@@ -1,4 +1,4 @@
-"""Prints errors and warnings of the command line in one line each; defines its exit codes."""
+"""Prints results, errors and warnings of the command line, one line each, and defines its exit codes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 from tqdm import tqdm
 
-if TYPE_CHECKING:  # importing this module would import torch
+if TYPE_CHECKING:  # not at runtime, since this import would import torch
     from torchrl_her_recipes.studies.study import StudyResult
 
 FAILED = 1
@@ -23,7 +23,7 @@ _HARDLY = 0.1  # below this success, a run has hardly learned anything
 
 
 def fail(message: str) -> int:
-    """Prints why a command failed, and returns its exit code."""
+    """Prints a message to the standard error stream, and returns the exit code for bad input."""
     click.echo(f"torchrl-her: {message}", err=True)
     return BAD_INPUT
 
@@ -53,7 +53,7 @@ def _message(error: BaseException) -> str:
 
 
 def say_result(result: StudyResult, *, of: str = "") -> None:
-    """Prints failed jobs of a study or sweep, and the success of finished ones.
+    """Prints the failed jobs of a study or sweep with their errors, and the success of finished jobs.
 
     Args:
         of: text before the names of failed jobs.
@@ -82,7 +82,7 @@ def success_line(successes: Sequence[float]) -> str:
 
 
 def file_name(task: str) -> str:
-    """Converts a task's name to a part of a file name: gym:ID has characters that some file systems refuse.
+    """Replaces the characters in a task's name that some file systems do not allow in names of files.
 
     Example:
         >>> file_name("gym:torchrl_her/HandThrow-v1")

@@ -1,4 +1,4 @@
-"""``torchrl-her study`` and ``report``: whole comparisons, and pages about them."""
+"""``torchrl-her study`` trains all runs of a comparison; ``torchrl-her report`` writes a page about runs."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import click
 from click.shell_completion import CompletionItem
 
-import torchrl_her_recipes as recipes  # its names are loaded when they are used: torch comes with them
+import torchrl_her_recipes as recipes  # imports torch only when one of its names is used
 from torchrl_her_recipes.cli.say import FAILED, INTERRUPTED, say_result
 from torchrl_her_recipes.config.study import load_study, study_names
 
@@ -22,20 +22,20 @@ def _complete(_context: click.Context, _parameter: click.Parameter, incomplete: 
 
 @click.command(short_help="run a whole comparison on all cores and draw its figure")
 @click.argument("name", shell_complete=_complete)
-@click.option("--seeds", type=click.IntRange(1), help="runs of each combination")
+@click.option("--seeds", type=click.IntRange(1), help="number of seeds of each combination")
 @click.option("--frames", type=click.IntRange(1), help="environment steps of each run")
-@click.option("--quick", is_flag=True, help="shrink the study to minutes")
+@click.option("--quick", is_flag=True, help="shrink the study so that it takes minutes")
 @click.option("--folder", type=_FOLDER, help="output folder (default: runs/NAME)")
 @click.option(
-    "--plan", is_flag=True, help="only print the runs to do, and their time once some epochs are done"
+    "--plan", is_flag=True, help="only print the runs to do, with their time if some epochs are done"
 )
-@click.option("--jobs", type=click.IntRange(1), help="batched runs at once (default: one for each core)")
-@click.option("--ray", metavar="ADDRESS", help="over a Ray cluster: auto, or HOST:PORT")
+@click.option("--jobs", type=click.IntRange(1), help="batches of seeds that train at once (default: cores)")
+@click.option("--ray", metavar="ADDRESS", help="train on a Ray cluster at this address: auto, or HOST:PORT")
 @click.option(
     "--gpus-per-job",
     type=click.FloatRange(0.0),
     default=0.0,
-    help="with --ray, the share of a GPU that each batched run gets, as 0.25",
+    help="with --ray, number of GPUs for each job, such as 0.25 to share one among four",
 )
 def study(
     name: str,
@@ -48,7 +48,7 @@ def study(
     ray: str | None,
     gpus_per_job: float,
 ) -> int:
-    """Run the study NAME: one of torchrl-her list, or a .yaml file. The same command resumes it."""
+    """Train the study NAME, of `torchrl-her list` or a .yaml file. The same command resumes the study."""
     if jobs is not None and ray is not None:
         raise click.UsageError("--jobs and --ray cannot be given together")
     if gpus_per_job and ray is None:
@@ -76,11 +76,11 @@ def study(
 def _refuse_follow(_context: click.Context, _parameter: click.Parameter, given: bool) -> None:
     if given:
         raise click.UsageError(
-            "no option --follow; choose `tensorboard --logdir runs`, which shows curves while runs go on"
+            "no option --follow; choose `tensorboard --logdir runs`, which shows curves during training"
         )
 
 
-@click.command(short_help="write a page about a study or runs: curves, goals, a film")
+@click.command(short_help="write a page about a study or runs, with curves, goals and a film")
 @click.argument("names", metavar="NAME|RUN...", nargs=-1, required=True, shell_complete=_complete)
 @click.option("--folder", type=_FOLDER, help="folder of the study's runs (default: runs/NAME)")
 @click.option("--out", type=_FOLDER, help="folder of the page (default: FOLDER/report)")
@@ -88,13 +88,13 @@ def _refuse_follow(_context: click.Context, _parameter: click.Parameter, given: 
     "--export",
     "tidy",
     type=_FOLDER,
-    help="also write a study's numbers as tidy files into a folder",
+    help="also write the study's numbers, as CSV files with one row per value, into this folder",
 )
 @click.option("--follow", is_flag=True, hidden=True, expose_value=False, callback=_refuse_follow)
 def report(names: tuple[str, ...], folder: Path | None, out: Path | None, tidy: Path | None) -> int:
-    """Write a page about what there is of the study NAME, or of single runs; trains nothing.
+    """Write a page about the finished part of the study NAME, or about runs. Trains nothing.
 
-    RUN is the folder of a run, or a folder of such folders.
+    RUN is the folder of a run, or a folder that contains such folders.
     """
     home = Path(names[0])
     if home.is_dir() and names[0] not in study_names():

@@ -1,4 +1,4 @@
-"""``torchrl-her train``: one run, or a sweep over several."""
+"""``torchrl-her train``: trains one run, or all runs of a sweep."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import click
 import yaml
 
-import torchrl_her_recipes as recipes  # its names are loaded when they are used: torch comes with `build`
+import torchrl_her_recipes as recipes  # imports torch only when one of its names is used
 from torchrl_her_recipes.cli.say import FAILED, INTERRUPTED, say_result, success_line
 from torchrl_her_recipes.cli.train_options import (
     OptionsCommand,
@@ -24,15 +24,15 @@ from torchrl_her_recipes.config.resolve import auto_options
 
 
 @click.command(cls=OptionsCommand, short_help="train, or resume a run")
-@click.option("-m", "--multirun", is_flag=True, help="a sweep: algo=her,cher seed=0,1 are four runs")
-@click.option("--jobs", type=click.IntRange(1), help="runs of a sweep at once (default: one for each core)")
+@click.option("-m", "--multirun", is_flag=True, help="train a sweep: algo=her,cher seed=0,1 are four runs")
+@click.option("--jobs", type=click.IntRange(1), help="runs of a sweep that train at once (default: cores)")
 @click.option(
     "--resume",
     metavar="RUN",
     type=click.Path(path_type=Path),
-    help="resume the run in this folder; with epochs=N, up to N epochs",
+    help="resume the run in this folder; epochs=N sets a new total number of epochs",
 )
-@click.option("--show", is_flag=True, help="print all options of the run as YAML, and train nothing")
+@click.option("--show", is_flag=True, help="only print all options of the run as YAML")
 @folder_option
 @click.argument("options", metavar="[NAME=VALUE]...", nargs=-1, shell_complete=complete)
 def train(
@@ -79,8 +79,9 @@ def _train(recipe: Recipe, folder: Path) -> recipes.RunResult:
         click.echo(f"chosen for this environment (auto): {' '.join(values)}")
     if (stages := components.recipe.curriculum.stages) and recipe.curriculum.stages is None:
         click.echo(
-            f"curriculum found: entries {stages[0]['achieved_goal']} of the observation are first brought to "
-            "the achieved goal, which random actions seldom change (algo=filtered_her does without)"
+            f"algo=auto chose a curriculum, since random actions seldom change the achieved goal: the first "
+            f"stage brings entries {stages[0]['achieved_goal']} of the observation to the achieved goal "
+            "(algo=filtered_her trains without a curriculum)"
         )
     if recipe.learner.device == "auto":
         click.echo(f"learner.device=auto: {next(components.loss.parameters()).device}")
@@ -112,7 +113,8 @@ def _say_finished(home: recipes.RunFolder, changes: dict[str, Any]) -> None:
     epochs, rows = home.recipe().run.epochs, home.rows()
     if "epochs" not in changes and rows and rows[-1]["epoch"] >= epochs:
         click.echo(
-            f"it has finished its {epochs} epochs; with keep_buffer=true in its recipe, epochs=N adds more"
+            f"the run has finished its {epochs} epochs; epochs=N adds more, if it was trained with "
+            "keep_buffer=true"
         )
 
 
@@ -123,7 +125,7 @@ def _say_end(result: recipes.RunResult) -> int:
         imports = "".join(f"--import {module} " for module in imported_modules())
         task = recipes.RunFolder(result.folder).recipe().task.name
         allowed = " --allow-import" if needs_permission(task) else ""
-        click.echo(f"go on with: torchrl-her {imports}train --resume {result.folder}{allowed}")
+        click.echo(f"resume it with: torchrl-her {imports}train --resume {result.folder}{allowed}")
         return INTERRUPTED
     left = "" if result.reached == result.success else f", reached at some step {result.reached:.0%}"
     click.echo(f"{success_line(result.successes)}{left} in the last evaluation")

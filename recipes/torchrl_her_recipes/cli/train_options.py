@@ -1,4 +1,4 @@
-"""The arguments of ``torchrl-her train``: their help and completion, and the runs that they describe."""
+"""Help, completion and parsing of the arguments of ``torchrl-her train``."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ folder_option = click.option("--folder", metavar="DIR", help="output folder")
 
 
 def with_folder(options: tuple[str, ...], folder: str | None) -> tuple[str, ...]:
-    """Adds the folder of ``--folder`` to the arguments."""
+    """Adds ``folder=DIR`` to the arguments if ``--folder DIR`` was given."""
     return options if folder is None else (*options, f"folder={folder}")
 
 
 def requests(options: tuple[str, ...], *, multirun: bool) -> dict[Path, Recipe]:
-    """Returns the runs that arguments describe, by their folders."""
+    """Returns the recipes of the runs that arguments describe, by the folders of the runs."""
     now = f"{datetime.now():%Y-%m-%d_%H-%M-%S}"
     if not multirun:
         values = single(options)
@@ -57,7 +57,7 @@ def requests(options: tuple[str, ...], *, multirun: bool) -> dict[Path, Recipe]:
 
 
 def single(options: tuple[str, ...]) -> dict[str, Any]:
-    """Returns the values of arguments, none of which may be a sweep."""
+    """Returns the values of arguments by name; raises a ValueError if one has several values, for a sweep."""
     pairs = _pairs(options)
     for name, text in pairs:
         if name != "folder" and len(split_sweep(text)) > 1:
@@ -68,7 +68,7 @@ def single(options: tuple[str, ...]) -> dict[str, Any]:
 
 
 def _pairs(options: tuple[str, ...]) -> list[tuple[str, str]]:
-    """Splits arguments into names and texts of values, and checks the names."""
+    """Splits arguments into pairs of a name, which is checked, and the text of a value."""
     pairs = [parse_override(text) for text in options]
     check_once(pairs)
     return pairs
@@ -105,7 +105,7 @@ class OptionsCommand(click.Command):
 
 
 def _rows(group: str) -> Iterator[tuple[str, str]]:
-    """Yields options of a group with their help; it names the choices that have an option, if not all do."""
+    """Yields each option of a group with its help; names the choices that have it if the default does not."""
     if kind := KINDS.get(group):
         known = f"one of {', '.join(kind)}; `torchrl-her list` describes them"
         yield _written(group, "name", kind.default), known
@@ -133,7 +133,7 @@ def _written(group: str, name: str, default: Any) -> str:
 
 
 def complete(_context: click.Context, _parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    """Completes names of options (short or with their group), and values of options that take names."""
+    """Completes names of options (short or with their group), and values that are one of several names."""
     options = option_names()
     name, equals, begun = incomplete.partition("=")
     if equals:
@@ -149,7 +149,7 @@ def complete(_context: click.Context, _parameter: click.Parameter, incomplete: s
 
 
 def _values() -> dict[str, list[str]]:
-    """Returns the possible values of options that are names or one of a few choices."""
+    """Returns the possible values of each option that has a fixed list of them."""
     classes = [kind for group in GROUPS for kind in reversed(choices_of(group).values())]
     choices = {option.name: list(option.metadata["choices"]) for kind in classes for option in fields(kind)}
     return {**choices, **{group: list(kind) for group, kind in KINDS.items()}} | {

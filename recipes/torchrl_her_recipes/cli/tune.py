@@ -1,4 +1,4 @@
-"""``torchrl-her tune``: a search for good options."""
+"""``torchrl-her tune``: searches for good options."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 from tqdm import tqdm
 
-import torchrl_her_recipes as recipes  # its names are loaded when they are used: torch comes with `tune`
+import torchrl_her_recipes as recipes  # imports torch only when one of its names is used
 from torchrl_her_recipes.cli.overrides import ARGUMENTS
 from torchrl_her_recipes.cli.say import FAILED, INTERRUPTED, fail
 from torchrl_her_recipes.cli.train_options import complete, folder_option, label, single, with_folder
@@ -22,29 +22,27 @@ from torchrl_her_recipes.config.shortcuts import merge
 if TYPE_CHECKING:
     from torchrl_her_recipes.tuning.search import SearchResult
 
-_SEEDS = 3  # seeds of a trial
+_SEEDS = 3  # default number of seeds that each trial trains
 
 
 @click.command(short_help="search for good options with Optuna, on all cores")
-@click.option("--trials", type=click.IntRange(1), help="trials in all (default: 50, without --minutes)")
+@click.option("--trials", type=click.IntRange(1), help="total of trials (default: 50; none with --minutes)")
 @click.option(
     "--minutes", type=click.FloatRange(0.0, min_open=True), help="minutes after which no further trial begins"
 )
-@click.option("--jobs", type=click.IntRange(1), help="trials at once (default: one for each core)")
+@click.option("--jobs", type=click.IntRange(1), help="trials that train at once (default: one per core)")
 @click.option(
     "--space",
     "space_name",
     metavar="NAME|FILE",
-    help=f"the options that are varied: a YAML file, or {', '.join(space_names())} (default: the learner's)",
+    help=f"search space: a YAML file, or {', '.join(space_names())} (default: that of the learner)",
 )
-@click.option(
-    "--sampler", type=click.Choice(SAMPLERS), default="tpe", help="sampler of Optuna (default: tpe)"
-)
+@click.option("--sampler", type=click.Choice(SAMPLERS), default="tpe", help="Optuna's sampler (default: tpe)")
 @click.option(
     "--pruner",
     type=click.Choice(PRUNERS),
     default="median",
-    help="trials that end early: those below the median, all but a third at each rung of successive "
+    help="trials to end early: those below the median, all but the best third at each rung of successive "
     "halving, or none (default: median)",
 )
 @folder_option
@@ -61,8 +59,8 @@ def tune(
 ) -> int:
     """Search for good options; for instance: torchrl-her tune preset=demo num_runs=3 --trials 30
 
-    Options are given as to train; those that are given are not varied. Each trial trains num_runs seeds side
-    by side. The same command resumes a search.
+    Takes the options of `torchrl-her train`; options that are given are not varied. Each trial trains
+    num_runs seeds side by side. The same command resumes an interrupted search.
     """
     values = single(with_folder(options, folder))
     folder, preset = (values.pop(name, None) for name in ARGUMENTS[::-1])
@@ -79,8 +77,8 @@ def tune(
 
 
 def _say_trial(line: str) -> None:
-    tqdm.write(line)  # written above the progress bar, if there is one
-    sys.stdout.flush()  # so that a file gets the line at once, too
+    tqdm.write(line)  # unlike print, keeps the line above the progress bar
+    sys.stdout.flush()  # so that the line appears at once if the output goes to a file
 
 
 def _say(result: SearchResult) -> int:

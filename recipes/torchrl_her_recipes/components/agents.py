@@ -1,4 +1,4 @@
-"""The agent of a recipe, made by the builder of its learner."""
+"""Makes the agent of a run (networks, exploration, loss, optimizer) with the builder of its learner."""
 
 from __future__ import annotations
 
@@ -34,16 +34,16 @@ def make_agent(
     state: CurriculumState | None = None,
     device: torch.device = CPU,
 ) -> Agent:
-    """Makes the agent of one run, or of several side by side.
+    """Makes the agent of one run, or of several runs side by side.
 
     Args:
-        builder: Builder of its networks, exploration and loss.
-        seeds: Seeds of each run's weights.
+        builder: Builder of networks, exploration and loss.
+        seeds: Seed of the initial weights of each run.
         curriculum: Options of the curriculum.
-        state: Curriculum whose stages the networks see, or None.
-        device: Device on which it learns.
+        state: Curriculum and the stages of the runs; None without a curriculum.
+        device: Device on which the agent learns.
     """
-    # Made on the CPU, so that the first weights are the same whatever the device.
+    # Networks are made on the CPU, so that the initial weights are the same on every device.
     actor, critics = _networks(builder, seeds, curriculum, None if state is None else state.curriculum)
     actor, critics = actor.to(device), [critic.to(device) for critic in critics]
     exploration = builder.exploration().to(device)
@@ -83,7 +83,7 @@ def shape_of(
     *,
     rewards: tuple[float, float] = (-1.0, 0.0),
 ) -> AgentShape:
-    """Returns the inputs and outputs of the networks of some runs, as the task's environment has them."""
+    """Returns what networks need to fit an environment: keys and widths of inputs, actions, and rewards."""
     in_keys = ("observation", "desired_goal") if curriculum is None else ("input",)
     return AgentShape(
         task=task,
@@ -96,11 +96,11 @@ def shape_of(
 
 
 def find_learner(options: LearnerConfig, shape: AgentShape) -> type[LearnerConfig]:
-    """Returns the learner of options; "auto" is DDPG if actions are continuous, and DQN if they are discrete.
+    """Returns the class of learner options; for "auto", DDPG or DQN, as actions are continuous or discrete.
 
     Raises:
-        ValueError: it cannot choose such actions, cannot train several runs, or an option has no effect
-            with it.
+        ValueError: the learner does not support the task's kind of actions or several runs side by side, or
+            an option has no effect with it.
     """
     actions: Actions = "discrete" if isinstance(shape.action_spec, Categorical) else "continuous"
     learner = LEARNERS[BY_ACTIONS[actions]] if options.name == AUTO else type(options)
@@ -115,7 +115,7 @@ def find_learner(options: LearnerConfig, shape: AgentShape) -> type[LearnerConfi
             f"num_runs must be 1 with learner={learner.name}, which cannot train several runs side by side, "
             f"got {shape.runs}; sweep over seeds instead"
         )
-    for field in fields(options):  # "auto" has the options of DDPG
+    for field in fields(options):  # "auto" accepts the options of DDPG, but may stand for DQN
         value = getattr(options, field.name)
         if not hasattr(learner, field.name) and value != field.default:
             raise ValueError(f"{field.name}={value} has no effect with learner={learner.name}: leave it out")
@@ -123,7 +123,7 @@ def find_learner(options: LearnerConfig, shape: AgentShape) -> type[LearnerConfi
 
 
 def find_builder(options: LearnerConfig, shape: AgentShape, **given: Any) -> LearnerBuilder:
-    """Returns the builder of the learner of options, made with further arguments of its own."""
+    """Makes the builder for the learner in ``options``, with keyword arguments of :class:`LearnerBuilder`."""
     return load_name(find_learner(options, shape).maker)(options, shape, **given)
 
 
@@ -151,7 +151,7 @@ def _guide_of(
 def _networks(
     builder: LearnerBuilder, seeds: Sequence[int], options: CurriculumConfig, curriculum: Curriculum | None
 ) -> Networks:
-    """Returns the actor and the critics; the weights of each run depend on its own seed alone."""
+    """Returns actor and critics of all runs, where the weights of a run depend only on the run's seed."""
     with torch.random.fork_rng(devices=[]):
         alone = []
         for seed in seeds:

@@ -1,4 +1,4 @@
-"""Makes the components that a recipe asks for."""
+"""Builds the components of a run (environments, agent, replay buffer, collector) from a recipe."""
 
 from __future__ import annotations
 
@@ -34,19 +34,19 @@ from torchrl_her_recipes.config.recipe import Recipe
 
 
 def build(recipe: Recipe) -> Components:
-    """Makes the components that a recipe describes.
+    """Builds the components that a recipe describes.
 
     Args:
         recipe: recipe of the run.
 
     Raises:
-        ValueError: something in the recipe cannot work or does not fit into memory, or it names a module that
-            must not be imported.
+        ValueError: the recipe cannot be used with the task, its replay buffer does not fit into memory, or it
+            names a module that must not be imported.
     """
     recipe = resolved(recipe)
     envs, seeds, collection = TaskEnvs.of(recipe), recipe.seeds, recipe.collection
     processes = collection.processes
-    # If other processes collect, no episode runs in this environment: it only describes theirs.
+    # If other processes collect, this environment plays no episodes: only its specs are read.
     task = envs.make(1 if processes else collection.num_envs, seeds)
     progress = make_progress(recipe.order, envs.curriculum, task, seeds)
     check_order(recipe.order, progress, recipe.weights, processes, recipe.demonstrations.episodes)
@@ -109,9 +109,9 @@ def build(recipe: Recipe) -> Components:
 def make_collector(
     env: EnvBase, policy: TensorDictModuleBase, steps_per_batch: int, devices: Devices = ON_THE_CPU
 ) -> Collector:
-    """Runs a policy in the training environments, a few steps of each at a time."""
+    """Makes a collector whose batches have ``steps_per_batch`` steps of each training environment."""
     if devices == ON_THE_CPU:
-        # For policy and storage, too: with a policy device unset, TorchRL copies every entry in every step.
+        # One device for environment, policy and storage: else TorchRL copies every entry in every step.
         places = {"device": env.device}
     else:
         learner, replay = devices
@@ -127,5 +127,5 @@ def make_collector(
 
 
 def eval_seeds(seeds: Sequence[int], epoch: int) -> list[int]:
-    """Returns the seeds of an evaluation; they differ between runs and epochs, and from seeds of training."""
+    """Returns each run's seed for the evaluation after an epoch, which no training or other epoch uses."""
     return [Stream.EVALUATION + (seed << 20) + epoch for seed in seeds]

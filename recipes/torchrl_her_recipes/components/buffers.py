@@ -1,4 +1,4 @@
-"""The replay buffer of all runs."""
+"""Makes the replay buffer that all runs share, with the writer that relabels and the sampler."""
 
 from __future__ import annotations
 
@@ -59,19 +59,20 @@ def make_buffer(
     devices: Devices = ON_THE_CPU,
     capacity: int | None = None,
 ) -> TensorDictReplayBuffer:
-    """Makes the replay buffer of all runs, with the hindsight writer and the sampler.
+    """Makes the replay buffer that all runs share, with the writer that relabels and the sampler.
 
     Args:
         recipe: recipe of the runs.
         env: environment of the task.
-        generators: sources of random numbers, one for each run, on the device of the buffer.
+        generators: random generators, one for each run, on the device of the buffer.
 
     Keyword Args:
-        space: space of the goals; None if goals are not counted.
-        state: the curriculum, or None.
-        norm: statistics, updated by written and applied to sampled transitions; None to normalize nothing.
+        space: space of the goals, for weights that count goals; None without one.
+        state: curriculum and stages of the runs; None without a curriculum.
+        norm: statistics that written transitions update and by which sampled transitions are normalized; None
+            to sample transitions as they are.
         devices: devices of the buffer and of the learner that samples from it.
-        capacity: number of transitions of each run; the recipe's number if None.
+        capacity: number of transitions per run; None for the recipe's ``buffer_size``.
     """
     size, task, runs = recipe.replay.buffer_size, goal_env(env), len(generators)
     check_buffer_size(size, runs, env, devices.replay, not_stored=_NOT_STORED)
@@ -124,10 +125,10 @@ def _make_writer(options: HindsightConfig, env: EnvBase, **others: Any) -> HERWr
 
 
 def _rules(state: CurriculumState | None, task: RewardFunction, *, every: bool) -> list[StageRule] | None:
-    """Returns each stage's rules for relabeling if each episode has a stage of its own, else None.
+    """Returns a rule for relabeling in each stage, if episodes have stages of their own; else None.
 
     Args:
-        every: whether episodes are written for all stages.
+        every: whether each episode is stored for all stages, not only for its own.
     """
     if state is None or not state.progress.by_episode:
         return None
@@ -139,7 +140,7 @@ def _rules(state: CurriculumState | None, task: RewardFunction, *, every: bool) 
 
 
 def _goals(options: HindsightConfig) -> dict[str, Any]:
-    """Returns the writer's options for numbers and sources of virtual goals."""
+    """Returns the arguments of ``HERWriter`` for the number and the sources of virtual goals."""
     if not options.algorithm.virtual:
         return {"k": 0}
     if options.goal_sources is not None:
@@ -148,7 +149,7 @@ def _goals(options: HindsightConfig) -> dict[str, Any]:
 
 
 def rising_beta(sampler: Sampler, end: float | None, epochs: int) -> list[LinearScheduler]:
-    """Returns the schedule of ``priority_beta``, one step for each epoch; no schedule if it is constant."""
+    """Returns a list with the scheduler that raises ``priority_beta`` each epoch, or [] if it is constant."""
     if end is None or not isinstance(sampler, PrioritizedSampler):
         return []
     return [LinearScheduler(sampler, "beta", end, max(1, epochs - 1))]
@@ -163,7 +164,8 @@ def _make_sampler(
 ) -> Sampler:
     if options.sampler == "uniform":
         return RunsSampler(capacity, runs=len(generators), generators=generators, device=device)
-    # The option alpha is for absolute TD errors (Schaul et al.). Most losses of TorchRL give squared errors.
+    # The option alpha is an exponent of absolute TD errors (Schaul et al.), but most of TorchRL's losses
+    # write squared errors: their exponent is half of it.
     return RunsPrioritizedSampler(
         capacity,
         alpha=options.priority_alpha / power,
@@ -177,7 +179,7 @@ def _make_sampler(
 def check_buffer_size(
     size: int, runs: int, env: EnvBase, device: torch.device, *, not_stored: Sequence[str] = ()
 ) -> None:
-    """Refuses a replay buffer that is larger than the memory of its device."""
+    """Raises a ValueError if a replay buffer for all runs would need more memory than its device has."""
     step = env.fake_tensordict().exclude(*in_root_and_next(not_stored))
     row = sum(entry.numel() * entry.element_size() for entry in step.values(True, True)) // env.numel()
     capacity = memory_of(device)
@@ -189,7 +191,7 @@ def check_buffer_size(
 
 
 def memory_of(device: torch.device) -> float:
-    """Returns the bytes of memory of a device; infinity if the number is unknown."""
+    """Returns the memory of a device in bytes; infinity if it is unknown."""
     if device.type == "cuda" and torch.cuda.device_count():
         return float(torch.cuda.get_device_properties(device).total_memory)
     if device.type != "cpu" or not hasattr(os, "sysconf"):

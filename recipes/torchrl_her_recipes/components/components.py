@@ -1,4 +1,4 @@
-"""The components of a run as named attributes, made from a recipe."""
+"""The class :class:`Components`, which holds all components of a run as named attributes."""
 
 from __future__ import annotations
 
@@ -34,41 +34,43 @@ from torchrl_her_recipes.config.recipe import Recipe
 
 @dataclass(kw_only=True)
 class Components(Agent):
-    """All parts of a run, or of R independent runs side by side. Replace any of them, then run it.
+    """All components of a run, or of R independent runs side by side.
 
-    A loss of your own needs its own optimizer and target updater; an environment of your own, its
-    own collector.
+    Any component can be replaced before the run starts. A new loss also needs a new optimizer and target
+    updater; a new environment also needs a new collector.
 
     Attributes:
-        recipe: recipe of the components.
-        env: batched training environments, one block of equal size for each of the R runs. If other processes
-            collect, a block is one environment.
-        eval_env: batched environments for evaluation: R equal blocks.
+        recipe: recipe from which the components were built.
+        env: batched training environments: R blocks of equal size, one for each run. If other processes
+            collect, each block has one environment, whose specs are read.
+        eval_env: batched environments for evaluation: R blocks of equal size.
         actor: the greedy policy. With ``normalize=true`` it is a
-            :class:`~torchrl_her.modules.NormalizedPolicy`, and losses take its ``actor``.
+            :class:`~torchrl_her.modules.NormalizedPolicy`, whose ``actor`` is the module for losses.
         critic: module from which the loss makes its critics, values of (observation, goal, action); None if
-            there is none. TD3 and SAC train copies, see :func:`~torchrl_her.objectives.critic_value`.
-        exploration: turns greedy into exploring actions.
-        policy: actor, then the guide if there is one, then exploration.
+            the loss needs none. TD3 and SAC train copies, see :func:`~torchrl_her.objectives.critic_value`.
+        exploration: module that turns greedy actions into exploring actions.
+        policy: actor, guide (if there is one) and exploration, in sequence.
         collector: runs the policy in the environments.
         buffer: replay buffer of all runs, with the writer that relabels and the sampler.
         loss: any TorchRL loss module.
         optimizer: optimizer of the loss module's parameters.
         target: updates the target networks.
         curriculum: the curriculum and the stage of each run, or None.
-        goal_target: q* [cells], the target distribution of IBS over a grid of goals; the divergence of
-            virtual goals is measured to it. None if goals are not counted on a grid.
-        generators: sources of the random numbers of each run (exploration, relabeling, sampling).
+        goal_target: q* [cells], the target distribution of IBS over a grid of goals, to which the divergence
+            of virtual goals is measured; None if goals are not counted on a grid.
+        generators: random generators for exploration, relabeling and sampling, one for each run; twice as
+            many if learner and buffer are on different devices.
         rewards: reward of a missed goal and of an achieved goal.
         bounds: the least and the greatest reward; infinite if rewards have no bounds.
-        norm: statistics of observations and goals by which actor and sampled transitions are normalized, or
+        norm: statistics by which observations and goals are normalized for the actor and in sampled
+            transitions, or None.
+        average: moving average of the actor, which is evaluated, filmed and saved in its place; or None.
+        guide: module that lets an earlier stage's policy act first in some episodes (``guided_share``), or
             None.
-        average: moving average of the actor, which is evaluated, filmed and saved instead of it; or None.
-        guide: policy of the stage below, which begins episodes, see ``guided_share``; or None.
         virtual_env: environments for evaluation at virtual goals, or None.
         behavior: transform of the environment that proposes the goals of episodes, or None. Its state is
             part of the collector's state.
-        demonstrations: recorded episodes, in batches and as starts of episodes; or None.
+        demonstrations: recorded episodes, used in batches and as starts of episodes; or None.
     """
 
     recipe: Recipe
@@ -87,24 +89,24 @@ class Components(Agent):
 
     @property
     def greedy(self) -> TensorDictModuleBase:
-        """The greedy policy that is evaluated, filmed and kept: the average of the actor, or the actor."""
+        """The greedy policy that is evaluated and saved: the average of the actor, or else the actor."""
         average = self.average
         return self.actor if average is None or average.policy is not self.actor else average.module
 
     @property
     def player(self) -> TensorDictModuleBase:
-        """The greedy policy on the device of the environments; a copy if it learns on another device."""
+        """The greedy policy on the environments' device: a copy, if the agent learns on another device."""
         policy, place = self.greedy, self.eval_env.device or CPU
         return policy if place_of(policy) == place else deepcopy(policy).to(place)
 
     def learner(self) -> Learner:
-        """Makes the learner: compiled gradient steps if that is possible, else steps through the loss module.
+        """Makes the learner, whose gradient steps are compiled if possible, or else call the loss module.
 
-        On the CPU, compiled steps are C++. On a GPU they are CUDA graphs, and ``compile=always`` applies
-        ``torch.compile`` before they are recorded.
+        On the CPU, gradient steps are compiled to C++. On a GPU they are recorded as CUDA graphs; with
+        ``compile=always``, they pass through ``torch.compile`` first.
 
         Raises:
-            ValueError: ``compile=always``, and the steps cannot be compiled.
+            ValueError: ``compile=always`` is given, but the steps cannot be compiled.
         """
         choice, parts = self.recipe.learner.compile, (self.loss, self.optimizer, self.target)
         norm, runs = self.recipe.learner.max_grad_norm, self.recipe.run.num_runs
@@ -134,7 +136,7 @@ class Components(Agent):
         return why_not_fused(self.loss, self.target)
 
     def close(self) -> None:
-        """Ends the processes that collect, if there are any. They start again when they are needed."""
+        """Ends the processes that collect, if there are any; collecting another batch restarts them."""
         if isinstance(self.collector, ProcessCollector):
             self.collector.shutdown()
 

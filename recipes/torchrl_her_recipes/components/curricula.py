@@ -1,4 +1,4 @@
-"""The curriculum that a recipe asks for, and the stages that its runs are in."""
+"""Makes the curriculum of a recipe, the progress of its runs, and the transforms of environments for both."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class CurriculumState:
 
     Attributes:
         progress: the stage of each run.
-        stage_env: environments for evaluation at the goals of the runs' stages; None if each episode has a
+        stage_env: environments that evaluate each run at the goals of its stage; None if each episode has a
             stage of its own.
     """
 
@@ -39,7 +39,7 @@ class CurriculumState:
 
     @property
     def curriculum(self) -> Curriculum:
-        """The stages that the runs go through."""
+        """The list of stages, which is the same for all runs."""
         return self.progress.curriculum
 
     def at_the_top(self, run: int) -> bool:
@@ -48,7 +48,7 @@ class CurriculumState:
 
 
 def make_curriculum(options: CurriculumConfig | None, env: EnvBase) -> Curriculum | None:
-    """Returns the curriculum of the stages in the options, or of the task's own; None without options."""
+    """Makes the curriculum, with the stages in ``options`` or the task's own; None without ``options``."""
     if options is None:
         return None
     task = goal_env(env)
@@ -56,15 +56,15 @@ def make_curriculum(options: CurriculumConfig | None, env: EnvBase) -> Curriculu
 
 
 def read_curriculum(stages: object, env: GoalEnv) -> Curriculum:
-    """Returns a curriculum from plain values, which refer to entries of an environment's state.
+    """Makes a curriculum from plain values, which refer to entries of an environment's state.
 
-    The state is the observation with the desired goal behind it. Its entries may be given by the names that
-    the environment has for them (``env.state_names()``). The last stage is the environment's own task; stages
-    below it give the same rewards for missed and achieved goals.
+    The state is the observation followed by the desired goal. Its entries are given by index, or by the names
+    that the environment has for them (``env.state_names()``). The last stage is the environment's own task.
+    Earlier stages have the task's two rewards, of a missed and of an achieved goal.
 
     Args:
-        stages: a list of mappings with the options of :class:`~torchrl_her.CurriculumStage`.
-        env: environment whose rewards and width of the state are used.
+        stages: list of mappings, each with the options of a :class:`~torchrl_her.CurriculumStage`.
+        env: environment that defines the rewards and the width of the state.
 
     Example:
         >>> from torchrl_her_envs import make_env
@@ -93,14 +93,14 @@ def _read_stage(options: Any, env: GoalEnv, *, is_last: bool) -> CurriculumStage
                 "environment judges; leave it out"
             )
         return CurriculumStage(**options, rewards=reward_range(env))
-    except TypeError as error:  # options are missing or unknown, or this is no mapping
+    except TypeError as error:  # options are missing or unknown, or ``options`` is not a mapping
         raise ValueError(f"{options!r} is no stage of a curriculum: {error}") from error
 
 
 def make_curriculum_state(
     progress: CurriculumProgress | None, envs: TaskEnvs, num_envs: int, seeds: Sequence[int]
 ) -> CurriculumState | None:
-    """Returns the curriculum of some runs, with ``num_envs`` environments that evaluate each in its stage."""
+    """Makes the state of runs from their progress, with ``num_envs`` environments for each run, or None."""
     if progress is None:
         return None
     by_run = not isinstance(progress, EpisodeStages)
@@ -113,9 +113,9 @@ def check_order(
     """Refuses options that cannot be used if each episode has a stage of its own.
 
     Raises:
-        ValueError: The weights would count goals of different stages together; processes collect, and
-            each would need the results of the others' episodes; or there are demonstrations, which are
-            relabeled for one stage of a run.
+        ValueError: Weights of goals are chosen, which would count goals of different stages together; several
+            processes collect although each needs the results of all episodes; or there are demonstrations,
+            which can be relabeled only for the single stage of a run.
     """
     if not isinstance(progress, EpisodeStages):
         return
@@ -139,7 +139,7 @@ def check_order(
 def make_progress(
     order: Order, options: CurriculumConfig | None, env: EnvBase, seeds: Sequence[int]
 ) -> CurriculumProgress | None:
-    """Returns the stages of some runs at the beginning of training; None without a curriculum."""
+    """Makes the record of the runs' stages at the beginning of training; None without a curriculum."""
     if (curriculum := make_curriculum(options, env)) is None:
         return None
     progress: CurriculumProgress = load_name(order.maker)(
@@ -149,7 +149,7 @@ def make_progress(
 
 
 def make_threshold(options: Threshold, curriculum: Curriculum, *, runs: int, **_: Any) -> CurriculumProgress:
-    """Runs learn one stage after the other."""
+    """Makes the order ``threshold``: runs learn one stage after the other."""
     return CurriculumProgress(
         curriculum,
         runs=runs,
@@ -160,12 +160,12 @@ def make_threshold(options: Threshold, curriculum: Curriculum, *, runs: int, **_
 
 
 def make_all_at_once(options: AllAtOnce, curriculum: Curriculum, **runs: Any) -> EpisodeStages:
-    """Draws each episode's stage, with constant probabilities."""
+    """Makes the order ``all_at_once``: each episode's stage is drawn with constant probabilities."""
     return EpisodeStages(curriculum, **runs, task_share=options.task_share)
 
 
 def make_teacher(options: Teacher, curriculum: Curriculum, **runs: Any) -> TeacherStudent:
-    """Draws each episode's stage; a stage whose success changes is more probable."""
+    """Makes the order ``teacher_student``: stages whose success changes are drawn more often."""
     return TeacherStudent(
         curriculum,
         **runs,
@@ -183,7 +183,7 @@ def make_played_env(
     pictures: bool = False,
     behavior: BehaviorGoals | None = None,
 ) -> EnvBase:
-    """Returns environments for a trained policy: in the last stage of the curriculum, if there is one."""
+    """Makes environments for playing a trained policy; with a curriculum, all are in its last stage."""
     env = envs.make(num_envs, seeds, pictures=pictures)
     curriculum = make_curriculum(envs.curriculum, env)
     progress = None if curriculum is None else at_the_top(curriculum, len(seeds))
@@ -191,7 +191,7 @@ def make_played_env(
 
 
 def is_guided(options: CurriculumConfig | None, progress: CurriculumProgress | None) -> bool:
-    """Returns whether the policy of the stage below chooses the first actions of some episodes."""
+    """Returns whether an earlier stage's policy acts first in some episodes (``guided_share``)."""
     if options is None or progress is None:
         return False
     return options.guided_share > 0 and len(progress.curriculum) > 1
@@ -205,19 +205,19 @@ def in_stages(
     behavior: BehaviorGoals | None = None,
     starts: DemonstrationStarts | None = None,
 ) -> EnvBase:
-    """Adds the transforms for stages, for the input of networks, and for proposed goals to an environment.
+    """Adds transforms for stages, network inputs, proposed goals and demonstrated starts to an environment.
 
     Args:
         env: environment of the full task.
         progress: stages of the runs; None without a curriculum.
 
     Keyword Args:
-        begins: whether steps have an entry ``is_init``, which is true of an episode's first step.
-        behavior: proposes goals, if there is one.
-        starts: starts episodes at demonstrations; None if there are no such episodes.
+        begins: whether to add the entry ``is_init``, which is true in an episode's first step.
+        behavior: transform that proposes goals, or None.
+        starts: transform that starts episodes at states of demonstrations, or None.
     """
     if progress is None:
-        chooses_goals = behavior if starts is None else starts  # a recipe has one of them at most
+        chooses_goals = behavior if starts is None else starts  # a recipe must not have both
         return env if chooses_goals is None else TransformedEnv(env, chooses_goals, auto_unwrap=True)
     curriculum = progress.curriculum
     state_to_obs = StateToObs(
@@ -237,7 +237,7 @@ def in_stages(
 
 
 def at_the_top(curriculum: Curriculum, runs: int) -> CurriculumProgress:
-    """Progress of runs that are all in the last stage: the full task."""
+    """Returns the progress of runs that are all in the last stage, which is the full task."""
     progress = CurriculumProgress(curriculum, runs=runs)
     for run in range(runs):
         progress.set_stage(run, len(curriculum) - 1)

@@ -1,4 +1,4 @@
-"""The demonstrations of a recipe: rows in a buffer of their own, and starts of episodes."""
+"""Loads the demonstrations of a recipe and prepares them, as rows of a buffer and as starts of episodes."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ class RunDemonstrations:
     """The demonstrations of several runs side by side.
 
     Attributes:
-        recorded: demonstrations from the file that are used, with the goals of the full task.
-        env: environment of the task; its rewards are used if there is no curriculum.
-        state: the curriculum, or None.
-        buffer: relabeled rows of the demonstrations; None if batches contain none.
-        starts: starts episodes at states of demonstrations; None if no episode does so.
+        recorded: the demonstrations that are used, with the goals of the full task.
+        env: environment of the task, which gives the rewards of the full task.
+        state: curriculum and stages of the runs; None without a curriculum.
+        buffer: replay buffer with the demonstrations and their virtual rows; None if batches contain none.
+        starts: transform that starts episodes at states of demonstrations, or None.
     """
 
     recorded: Demonstrations
@@ -43,20 +43,20 @@ class RunDemonstrations:
     starts: DemonstrationStarts | None = None
 
     def shown(self, run: int) -> Demonstrations:
-        """Returns the demonstrations with observations and goals of a run's stage, and the task's rewards."""
+        """Returns the demonstrations as seen in a run's stage, with the stage's goals and rewards."""
         rule = task_reward(self.env)
         if self.state is None:
             return with_reward(self.recorded, rule)
         return in_stage(self.recorded, self.state.curriculum, self.state.progress.stages[run], rule)
 
     def fill(self, buffer: TensorDictReplayBuffer, runs: int) -> None:
-        """Writes the rows of all runs into an empty buffer."""
+        """Writes the demonstrations for each run into an empty buffer, and keeps the buffer."""
         self.buffer = buffer
         for run in range(runs):
             write_demonstrations(buffer, self.shown(run), run=run)
 
     def enter_stage(self, run: int) -> None:
-        """Replaces a run's demonstrations by the demonstrations of the stage that it has entered."""
+        """Rewrites a run's demonstrations with observations and goals of the stage that it has entered."""
         assert self.state is not None
         if self.buffer is not None:
             enter_stage(self.buffer, self.state.progress.stage_of(run), run=run)
@@ -65,17 +65,17 @@ class RunDemonstrations:
             self.starts.show(self.shown(run), run=run)
 
     def mixed_with(self, buffer: TensorDictReplayBuffer, share: float, batch_size: int) -> Any:
-        """Returns a buffer in whose batches a share of the rows are demonstrations."""
+        """Returns a buffer whose samples mix rows of ``buffer`` with a share of demonstrations."""
         if self.buffer is None:
             return buffer
         return MixedReplay(buffer, self.buffer, share=share, batch_size=batch_size)
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns tensors and plain data. The state of ``starts`` is a part of the collector's state."""
+        """Returns the buffer's state. The state of ``starts`` is part of the collector's state instead."""
         return {"buffer": None if self.buffer is None else buffer_state_dict(self.buffer, copy=False)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restores the state that :meth:`state_dict` returned; restore the curriculum's progress before."""
+        """Restores the state that :meth:`state_dict` returned. Restore the curriculum's progress first."""
         if self.buffer is not None:
             self.buffer.empty()
             load_buffer_state_dict(self.buffer, state["buffer"])
@@ -95,11 +95,11 @@ def load_demonstrations(
     seeds: Sequence[int],
     state: CurriculumState | None,
 ) -> RunDemonstrations | None:
-    """Returns the demonstrations of some runs, still without a buffer; None if ``episodes`` is 0.
+    """Loads the demonstrations of a recipe, without filling a buffer; returns None if ``episodes`` is 0.
 
     Raises:
-        ValueError: an option cannot be used with demonstrations, or the file cannot be read, is of another
-            task, has too few episodes, or has no states that episodes could start at.
+        ValueError: an option cannot be used with demonstrations, the file cannot be read, or its
+            demonstrations are of another task, too few, or without the states that starts need.
     """
     if options.episodes == 0:
         return None
@@ -135,7 +135,7 @@ def load_demonstrations(
 
 
 def _check(every: Demonstrations, file: str, task: str, env: EnvBase) -> None:
-    """Refuses demonstrations of another task, or whose observations or goals have other widths."""
+    """Refuses demonstrations that differ from the run in the task, or in widths of observations or goals."""
     if every.task != task:
         raise ValueError(f"{file} holds demonstrations of {every.task}, not of {task}")
     base: Any = goal_env(env)
@@ -154,7 +154,7 @@ def _check(every: Demonstrations, file: str, task: str, env: EnvBase) -> None:
 
 
 def _scaled(recorded: Demonstrations, env: EnvBase) -> Demonstrations:
-    """Returns demonstrations whose actions are scaled to -1 to 1, as learners take them."""
+    """Returns demonstrations with actions scaled to the range -1 to 1, which learners use."""
     low, high = action_bounds(env)
     if low.eq(-1).all() and high.eq(1).all():
         return recorded
@@ -165,13 +165,13 @@ def _scaled(recorded: Demonstrations, env: EnvBase) -> Demonstrations:
 
 
 def make_cloning(options: DemonstrationsConfig) -> Cloning | None:
-    """Returns the settings with which losses clone demonstrations; None if losses do not clone them."""
+    """Returns the settings for behavior cloning of demonstrations in the loss; None without cloning."""
     if not options.in_batches or options.bc_weight == 0:
         return None
     return Cloning(weight=options.bc_weight, q_filter=options.q_filter)
 
 
 def rows_needed(hindsight: HindsightConfig, demonstrations: Demonstrations) -> int:
-    """Returns how many rows a run needs at most for demonstrations, virtual ones among them."""
+    """Returns the largest number of rows that a run's demonstrations can fill, virtual rows included."""
     copies = sum(hindsight.sources.values()) * hindsight.refill if hindsight.algorithm.virtual else 0
     return len(demonstrations.rows) * (1 + copies)

@@ -1,4 +1,4 @@
-"""Devices on which networks learn and transitions are stored."""
+"""Chooses the devices on which networks learn and transitions are stored."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from torchrl_her_recipes.config.choices.learners import LearnerConfig
 from torchrl_her_recipes.config.groups import ReplayConfig
 
 CPU = torch.device("cpu")
-_WORTH_IT = 1e9  # multiplications in a gradient step of all runs; from this number on a GPU is faster
+_WORTH_IT = 1e9  # multiplications in a gradient step of all runs, above which a GPU is faster
 
 
 class Devices(NamedTuple):
-    """Devices of the parts of a run. Environments are on the CPU.
+    """Devices of the learner and the replay buffer. Environments are always on the CPU.
 
     Attributes:
         learner: device of networks, losses, optimizer and the policy that acts.
@@ -31,7 +31,7 @@ ON_THE_CPU = Devices(CPU, CPU)
 
 
 def devices_of(learner: LearnerConfig, replay: ReplayConfig, runs: int) -> Devices:
-    """Returns the devices of learner and buffer; "auto" is a GPU if gradient steps are large enough."""
+    """Returns the devices of learner and buffer; "auto" is a GPU only if gradient steps are large."""
     device = learner.device
     if device == "auto":
         work = 6 * learner.hidden_weights * replay.batch_size * runs
@@ -48,12 +48,12 @@ def place_of(module: nn.Module) -> torch.device:
 
 
 def make_generators(seeds: Sequence[int], device: torch.device) -> list[torch.Generator]:
-    """Sources of random numbers on a device, one for each run."""
+    """Returns random generators on a device, one for each seed."""
     return [torch.Generator(device).manual_seed(seed) for seed in seeds]
 
 
 def _find(name: str, option: str, word: str) -> torch.device:
-    """Returns the device with this name; raises an error if it is missing or cannot draw random numbers."""
+    """Returns the device with this name; raises a ValueError if it is missing or has no random generators."""
     try:
         device = torch.device(name)
     except RuntimeError:
@@ -69,5 +69,5 @@ def _find(name: str, option: str, word: str) -> torch.device:
         torch.Generator(device)
     except (RuntimeError, AssertionError, NotImplementedError) as error:
         reason = " ".join(str(error).split()).partition(". ")[0]
-        raise ValueError(f"{option}={name} is not there: {reason}; cpu always is") from error
+        raise ValueError(f"{option}={name} is not available: {reason}; cpu always is") from error
     return device

@@ -1,4 +1,4 @@
-"""The environments that a recipe asks for."""
+"""Makes the environments of a recipe, and plays episodes in them."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from torchrl_her_recipes.config.recipe import Recipe
 
 Player = Callable[[TensorDictBase], TensorDictBase]
 
-_AT_ONCE = 20  # gymnasium environments in an evaluation, at most: each takes 10 MB or more
+_AT_ONCE = 20  # largest number of gymnasium environments in an evaluation: each takes 10 MB or more
 
 
 def evaluation_envs(task: str, episodes: int) -> int:
-    """Returns the number of environments that evaluate each run; each may play several episodes.
+    """Returns the number of environments that evaluate a run; with many episodes, each plays several.
 
     Example:
         >>> evaluation_envs("hand_v0", 45), evaluation_envs("gym:FetchPush-v4", 45)
@@ -39,18 +39,18 @@ def evaluation_envs(task: str, episodes: int) -> int:
 
 
 def play_episodes(env: EnvBase, policy: Player, episodes: int, *, runs: int = 1) -> TensorDictBase:
-    """Plays greedy episodes of R runs, in as many rounds as the environments need for them.
+    """Plays greedy episodes of R runs, in several rounds if there are fewer environments than episodes.
 
     Args:
         env: R equal blocks of environments.
-        policy: acts in all of them.
+        policy: policy that acts in all environments.
         episodes: number of episodes of each run.
 
     Keyword Args:
         runs: R.
 
     Returns:
-        The rollout [R * episodes, T], run after run.
+        The rollout [R * episodes, T], with the episodes of each run together.
     """
     worlds, max_steps = env.batch_size[0] // runs, goal_env(env).max_steps
     played = [evaluate(env, policy, max_steps=max_steps) for _ in range(math.ceil(episodes / worlds))]
@@ -66,8 +66,8 @@ class TaskEnvs:
     Attributes:
         task: Task and its options.
         dtype: Name of the type of observations and rewards.
-        gamma: Discount factor, from which the return of never achieving the goal is computed.
-        curriculum: Options of the curriculum; None without one.
+        gamma: Discount factor, for the return of never achieving the goal, which is the reward of a failure.
+        curriculum: Options of the curriculum; None without a curriculum.
     """
 
     task: TaskConfig
@@ -77,7 +77,7 @@ class TaskEnvs:
 
     @classmethod
     def of(cls, recipe: Recipe) -> TaskEnvs:
-        """Returns the maker of a recipe's environments."""
+        """Returns an object that makes the environments of a recipe."""
         curriculum = recipe.curriculum if recipe.hindsight.algorithm.curriculum else None
         return cls(recipe.task, recipe.run.dtype, recipe.learner.gamma, curriculum)
 
@@ -91,10 +91,10 @@ class TaskEnvs:
             seeds: Seeds of the environments.
 
         Keyword Args:
-            pictures: Whether the environments are made to render pictures, if they can.
-            scaled: Whether environments are as learners take them: continuous actions go from -1 to 1, and
-                failures have the reward that ``task.failure`` gives. If not, actions have the task's own
-                bounds, as in exported policies and recorded demonstrations.
+            pictures: Whether environments that can render pictures are made so that they do.
+            scaled: True for learning: continuous actions are in the range -1 to 1, and ``task.failure``
+                determines the reward of failures. False for the task's own actions and rewards, as exported
+                policies and recorded demonstrations use them.
         """
         task = self.task
         if foreign_module(task.name):
@@ -122,9 +122,9 @@ class TaskEnvs:
 
 
 def action_bounds(env: EnvBase) -> tuple[Tensor, Tensor]:
-    """Returns the least and the greatest actions of a task, [actions]; -1 and 1 if its bounds are not finite.
+    """Returns a task's own bounds of actions, low and high [actions]; -1 and 1 if they are not finite.
 
-    The bounds are the task's own, before a transform scales actions.
+    Transforms that scale actions do not change this result.
     """
     actions = goal_env(env).action_spec_unbatched
     if isinstance(actions, Bounded) and bool((actions.low.isfinite() & actions.high.isfinite()).all()):
@@ -134,11 +134,11 @@ def action_bounds(env: EnvBase) -> tuple[Tensor, Tensor]:
 
 
 def task_reward(env: EnvBase) -> EnvReward:
-    """Returns the reward function of a task, below any transforms."""
+    """Returns the reward function of a task's environment, ignoring any transforms around it."""
     task = goal_env(env)
     return EnvReward(task.compute_reward, task.compute_terminated, info_keys=task.info_keys)
 
 
 def judging(env: EnvBase) -> dict[str, Any]:
-    """Options of :func:`~torchrl_her.success` for rollouts of a task that has no entry ``is_success``."""
+    """Returns arguments for :func:`~torchrl_her.success`, for rollouts without an entry ``is_success``."""
     return {"reward_fn": task_reward(env), "achieved_reward": reward_range(goal_env(env))[1]}

@@ -1,4 +1,4 @@
-"""The reward of failures, which end an episode before its goal is achieved, as a fall or a crash does."""
+"""Sets the reward of failures: ends of an episode without its goal, for instance by a fall or a crash."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from torchrl_her.goals.rewards import is_achieved
 
 
 class Failures(Transform):
-    """Sets the reward of a failure, a step that ends an episode without its goal, or truncates there.
+    """Changes the reward of failures (ends of an episode without its goal), or truncates episodes there.
 
-    With a reward of -1 for each step, failing soon can give the best return. It never does if the reward of
-    a failure is the return of never achieving the goal, ``missed_reward / (1 - gamma)``. Relabeling keeps
-    what a failure costs, so this holds for virtual goals, too.
+    If each step has a reward of -1, failing early can give the best return. This is avoided if the reward of
+    a failure is the return of never achieving the goal, ``missed_reward / (1 - gamma)``. Relabeling keeps the
+    reward of a failure, so the same is true for virtual goals.
 
     Args:
-        worth: the reward of a failure; None to truncate the episode there, with the reward as it is.
-        judged_by: options of :func:`~torchrl_her.goals.is_achieved`.
+        worth: the reward of a failure; None to truncate the episode without changing the reward.
+        judged_by: arguments of :func:`~torchrl_her.goals.is_achieved`, which decides if a goal is achieved.
     """
 
     def __init__(self, worth: float | None, judged_by: dict[str, Any]) -> None:

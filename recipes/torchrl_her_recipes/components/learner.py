@@ -1,4 +1,4 @@
-"""The base class of builders of learners: networks, exploration and a TorchRL loss."""
+"""Base class of builders, each of which makes the networks, exploration and loss of one learner."""
 
 from __future__ import annotations
 
@@ -41,13 +41,13 @@ class Agent:
 
 @dataclass(frozen=True, kw_only=True)
 class AgentShape:
-    """Inputs and outputs of the networks of one run, or of several side by side.
+    """Inputs, outputs and types of the networks of one run, or of several runs side by side.
 
     Attributes:
         task: Name of the task, for messages.
-        widths: Widths of the entries that networks read, in their order.
-        action_spec: Actions of one environment.
-        rewards: Least and greatest reward; infinite if the task's reward is dense.
+        widths: Width of each entry that networks read, by its key; networks concatenate them in this order.
+        action_spec: Spec of the actions of one environment.
+        rewards: Least and greatest reward; infinite if rewards have no bounds.
         runs: Number of runs.
         dtype: Type of the weights.
     """
@@ -61,20 +61,20 @@ class AgentShape:
 
 
 def acting(actor: TensorDictModuleBase, norm: RunningNorm | None) -> TensorDictModuleBase:
-    """Returns an actor for entries as environments give them; it normalizes them if ``norm`` is given."""
+    """Returns an actor that reads raw observations and goals, and normalizes them if ``norm`` is given."""
     return actor if norm is None else NormalizedPolicy(actor, norm)
 
 
 class LearnerBuilder(ABC):
-    """Builds networks, exploration and loss of a learner; a subclass for each learner.
+    """Builds networks, exploration and loss of a learner. Each learner has a subclass.
 
     Args:
         options: Options of the learner.
         shape: Inputs and outputs of its networks.
 
     Keyword Args:
-        generators: Sources of random numbers, one for each run; None for torch's own.
-        cloning: Settings with which the loss clones demonstrations; None if it does not clone them.
+        generators: Random generators, one for each run; None for torch's global generator.
+        cloning: Settings for behavior cloning of demonstrations in the loss; None without cloning.
     """
 
     def __init__(
@@ -91,15 +91,15 @@ class LearnerBuilder(ABC):
 
     @property
     def bounds(self) -> tuple[float, float] | None:
-        """Least and greatest reward, to whose returns targets are clamped; None without clamped targets."""
+        """Least and greatest reward, from which the clamping of targets follows; None without clamping."""
         return self.shape.rewards if getattr(self.options, "clamp_targets", True) else None
 
     @abstractmethod
     def networks(self, runs: int) -> Networks:
-        """Returns the actor and the critics of some runs side by side."""
+        """Makes the actor and the critics of ``runs`` runs side by side."""
 
     def norm(self) -> RunningNorm | None:
-        """Returns new statistics of the inputs of each run; None if inputs are not normalized."""
+        """Makes the statistics for normalizing inputs, empty at first; None if inputs are not normalized."""
         options = self.options
         if not options.normalize:
             return None
@@ -111,29 +111,29 @@ class LearnerBuilder(ABC):
         )
 
     def player(self, runs: int) -> TensorDictModule:
-        """Returns the actor alone. Override this if the learner can make an actor without making critics."""
+        """Makes the actor of ``runs`` runs. Override this if an actor can be made without critics."""
         return self.networks(runs)[0]
 
     def greedy(self, actor: TensorDictModule) -> nn.Module:
-        """Returns the network of an exported policy, from tensors (observation, goal) to the greedy action.
+        """Returns the module to export, which maps tensors (observation, goal) to the greedy action.
 
         Args:
             actor: actor of a single run, from :meth:`player`; the result shares its weights.
 
         Raises:
-            ValueError: the actor writes more than the action. A builder of such actors must override this.
+            ValueError: the actor writes other entries than the action; its builder must override this method.
         """
         if list(actor.out_keys) != ["action"]:
             raise ValueError(
-                f"a policy of learner={self.options.name} cannot be exported: its actor writes "
-                f"{', '.join(map(str, actor.out_keys))} and not the action alone; override "
+                f"a policy of learner={self.options.name} cannot be exported: its actor must write only "
+                f"the action, but writes {', '.join(map(str, actor.out_keys))}; override "
                 f"{type(self).__name__}.greedy"
             )
         return actor.module
 
     @abstractmethod
     def loss(self, actor: TensorDictModule, critics: Sequence[TensorDictModule]) -> LossModule:
-        """Makes TorchRL's loss.
+        """Makes the TorchRL loss that trains the networks.
 
         Args:
             actor: actor from :meth:`networks`.
@@ -141,18 +141,18 @@ class LearnerBuilder(ABC):
         """
 
     def exploration(self) -> Exploration:
-        """Returns the module that turns greedy into exploring actions, here for continuous actions."""
+        """Makes the module that turns greedy actions into exploring ones; override for discrete actions."""
         spec = self.action_spec
         return DecayingEpsilon(
             spec.low, spec.high, generators=self.generators, **self.epsilon(), **self.action_noise()
         )
 
     def epsilon(self) -> dict[str, float]:
-        """Returns the schedule of epsilon."""
+        """Returns the start, the decay and the end of epsilon, as arguments of the exploration module."""
         options = self.options
         return {"start": options.epsilon_start, "decay": options.epsilon_decay, "end": options.epsilon_end}
 
     def action_noise(self) -> dict[str, float]:
-        """Returns the options for noise and the share of uniform actions that the learner has."""
+        """Returns those of the options for noise and uniform actions that the learner has."""
         names = {"noise": "action_noise", "uniform_share": "uniform_share"}
         return {to: getattr(self.options, name) for to, name in names.items() if hasattr(self.options, name)}

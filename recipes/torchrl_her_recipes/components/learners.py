@@ -1,4 +1,4 @@
-"""Builders of learners, found by their names in :mod:`torchrl_her_recipes.config.choices.learners`."""
+"""Builders of the learners, to which :mod:`torchrl_her_recipes.config.choices.learners` refers by name."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class DDPGBuilder(LearnerBuilder):
         return self.actor(runs).to(self.dtype)
 
     def actor(self, runs: int) -> TensorDictModule:
-        """Returns the deterministic actor of some runs side by side."""
+        """Makes a deterministic actor for ``runs`` runs side by side."""
         return make_actor(
             self.widths,
             self.action_spec.shape[-1],
@@ -53,7 +53,7 @@ class DDPGBuilder(LearnerBuilder):
         return 1
 
     def critic(self, runs: int) -> TensorDictModule:
-        """Returns one critic of some runs side by side."""
+        """Makes one critic for ``runs`` runs side by side."""
         return make_critic(
             self.widths,
             self.action_spec.shape[-1],
@@ -67,7 +67,7 @@ class DDPGBuilder(LearnerBuilder):
         return make_ddpg_loss(actor, critics[0], **self.loss_options())
 
     def loss_options(self) -> dict[str, Any]:
-        """Returns the options that losses of learners with continuous actions share."""
+        """Returns the arguments that are common to the losses of all learners with continuous actions."""
         return {
             "targets": Targets(gamma=self.options.gamma, reward_range=self.bounds),
             "terms": ActorTerms(
@@ -121,7 +121,7 @@ class SACBuilder(DDPGBuilder):
 
     @property
     def bounds(self) -> tuple[float, float] | None:
-        """Bounds as of other learners; clamping raises an error if the task's rewards have no bounds."""
+        """Least and greatest reward for clamping, or None; raises if rewards to clamp by have no bounds."""
         if self.options.clamp_targets and not all(map(math.isfinite, self.shape.rewards)):
             raise ValueError(
                 f"clamp_targets=true has no effect on {self.shape.task}, whose rewards have no bounds: "
@@ -130,7 +130,7 @@ class SACBuilder(DDPGBuilder):
         return super().bounds
 
     def epsilon(self) -> dict[str, float]:
-        """Returns no schedule: the policy explores by itself."""
+        """Returns an epsilon of 0 throughout: the stochastic policy explores by itself."""
         return {"start": 0.0, "decay": 1.0, "end": 0.0}
 
 

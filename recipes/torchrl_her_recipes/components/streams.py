@@ -1,4 +1,4 @@
-"""Seeds for the parts of a run, so that no two parts draw the same random numbers."""
+"""Seeds for the components of a run, so that no two components draw the same random numbers."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torchrl_her_recipes.components.devices import CPU, make_generators
 
 
 class Stream(IntEnum):
-    """Numbers added to the seeds of the runs, which are below ``2 ** 31``, to make the seeds of a part."""
+    """Offsets that, added to the seed of a run (below ``2 ** 31``), give the seeds of its components."""
 
     EVALUATION = 1 << 32
     PROPOSED_GOALS = 1 << 33
@@ -21,5 +21,5 @@ class Stream(IntEnum):
 
 
 def generators_of(seeds: Sequence[int], stream: Stream) -> list[torch.Generator]:
-    """Returns the generators of a part, one for each run, seeded from the run's seed."""
+    """Returns the random generators of a component, one for each run, seeded by the run's seed."""
     return make_generators([stream + seed for seed in seeds], CPU)

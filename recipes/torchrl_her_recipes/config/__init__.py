@@ -1,1 +1,1 @@
-"""Configuration of runs as plain values. No module in here imports torch."""
+"""Configuration of runs as plain values. No module in this package imports torch."""

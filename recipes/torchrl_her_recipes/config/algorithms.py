@@ -1,4 +1,4 @@
-"""The algorithms by name, and the goal strategies: both are checked before torch is imported."""
+"""Table of the algorithms by name, and checks of the names of goal strategies, without importing torch."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from functools import partial
 from torchrl_her_recipes.config.options import AUTO, REGISTERED, what_there_is
 
 STRATEGIES = ("future", "final", "episode")  # goal strategies that come with the library
-RECENT = ("actual", "achieved")  # sources of virtual goals that are not strategies: goals of recent episodes
+RECENT = ("actual", "achieved")  # sources that take virtual goals from recent episodes, unlike strategies
 _STRATEGY_REGISTRY = "torchrl_her.goals.strategies"
 
 
 @dataclass(frozen=True)
 class Algorithm:
-    """An algorithm: a combination of hindsight, weights, curriculum and so on, on top of any learner.
+    """A named combination of hindsight, filter, goal weights and curriculum, usable with any learner.
 
     Args:
-        name: the name that recipes take.
+        name: value of the recipe's option ``algo``.
         summary: one-line description for users.
 
     Keyword Args:
-        virtual: whether virtual rows are written at all.
-        filter: whether virtual goals that were already achieved are left out.
-        weights: the weights of virtual goals; None if recipes choose them.
+        virtual: whether transitions with virtual goals are stored at all.
+        filter: whether virtual goals that were achieved before the action are left out.
+        weights: name of the weights of virtual goals; None if the recipe chooses them.
         curriculum: whether runs learn the stages of a curriculum (CHER).
     """
 
@@ -71,7 +71,7 @@ ALGORITHMS: dict[str, Algorithm] = {
 }
 
 
-_UNRESOLVED = Algorithm(name=AUTO, filter=True)  # for ``auto``, until the environment decides the algorithm
+_UNRESOLVED = Algorithm(name=AUTO, filter=True)  # stands for ``auto`` until the environment is known
 
 
 def register_algorithm(algorithm: Algorithm) -> None:
@@ -86,7 +86,7 @@ def register_algorithm(algorithm: Algorithm) -> None:
 
 
 def get_algorithm(name: str) -> Algorithm:
-    """Returns the algorithm of a name; for ``auto`` the options that all algorithms it can become share.
+    """Returns the algorithm with this name; for ``auto``, a placeholder that stands for filtered_her or cher.
 
     Raises:
         ValueError: no algorithm has this name; the message lists the algorithms.
@@ -107,8 +107,8 @@ def get_algorithm(name: str) -> Algorithm:
 def check_strategy(name: str) -> None:
     """Raises a ValueError for an unknown goal strategy.
 
-    Users' strategies are registered with the library, which they import for it. If the library was not
-    imported, only its own strategies exist, and the check does not import it.
+    Users must import the library to register a strategy. If the library has not been imported, only its
+    built-in strategies can exist, so that this check need not import it.
 
     Raises:
         ValueError: the strategy does not exist; the message lists the strategies.
@@ -122,7 +122,7 @@ def check_strategy(name: str) -> None:
 
 
 def check_goal_sources(sources: object) -> dict[str, int]:
-    """Checks the number of virtual goals for each source.
+    """Checks a mapping from sources of virtual goals to numbers of goals, and returns it as a dict.
 
     Example:
         >>> check_goal_sources({"future": 2, "actual": 2})

@@ -1,4 +1,4 @@
-"""The groups of options that a recipe is made of; the learner's group is in :mod:`.learners`."""
+"""The groups of options in a recipe, except those with several choices, which are in :mod:`.choices`."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from torchrl_her_recipes.config.plain_files import read_yaml
 
 @dataclass(frozen=True, kw_only=True)
 class Group:
-    """A group of options, which are checked when it is made.
+    """Base class of groups of options; an instance checks its options when it is created.
 
     Attributes:
         needs: Options that have an effect only with some values of another option; see ``idle_options``.
-        prefix: Text before the names of its options in messages.
+        prefix: Text before the names of the group's options in messages.
     """
 
     needs: ClassVar[Needs] = ()
@@ -41,14 +41,14 @@ class TaskConfig(Group):
         "my_module:make_env for a TorchRL environment of your own",
         shown_as="task",
     )
-    options: Any = option(None, "options of the task or for gymnasium.make, as in task.options.bits=8")
+    options: Any = option(None, "options of the task or of gymnasium.make, as in task.options.bits=8")
     threshold: float | None = option(
-        None, "distance to the goal that counts as achieved, in the coordinates that the agent sees", above=0
+        None, "distance below which a goal is achieved, in the coordinates that the agent sees", above=0
     )
     failure: str = option(
         "never_pays",
-        "what an end without the goal, as by a fall, is worth: never_pays (as if the goal was never "
-        "achieved), environment (the reward that it gives) or truncate (the episode is cut off there)",
+        "reward of a failure, as a fall: never_pays (the return of never achieving the goal), environment "
+        "(its own reward) or truncate (its own reward, and the episode is truncated, not terminated)",
         choices=("never_pays", "environment", "truncate"),
     )
 
@@ -67,33 +67,35 @@ class TaskConfig(Group):
 
 @dataclass(frozen=True, kw_only=True)
 class CollectionConfig(Group):
-    """How experience is collected; numbers are for each run."""
+    """How experience is collected; all numbers are per run."""
 
     needs: ClassVar[Needs] = (("processes", bool, "sync"),)
 
-    epoch_frames: int = option(AUTO, "environment steps in an epoch; auto: 100 episodes' length", at_least=1)
-    num_envs: int = option(
-        AUTO, "environments that are stepped together; auto: 8, or 64 of this package's tasks", at_least=1
+    epoch_frames: int = option(
+        AUTO, "environment steps in an epoch; auto: 100 episodes, or 4 per environment if batched", at_least=1
     )
-    steps_per_batch: int = option(10, "steps of each environment between two rounds of updates", at_least=1)
+    num_envs: int = option(
+        AUTO, "environments that are stepped together; auto: 8, or 64 for this package's tasks", at_least=1
+    )
+    steps_per_batch: int = option(10, "steps of each environment before gradient steps follow", at_least=1)
     frames_per_update: float = option(
         AUTO,
-        "environment steps for each gradient step; 0.5: two gradient steps for each environment step; "
-        "auto: 1, or 5 with this package's tasks",
+        "environment steps per gradient step; 0.5: two gradient steps per environment step; auto: 1, or 5 "
+        "for this package's tasks",
         above=0,
     )
     warmup_frames: int = option(
         AUTO,
-        "environment steps before the first gradient step; auto: an episode of each environment",
+        "environment steps before the first gradient step; auto: one episode per environment, at least 1,000",
         at_least=0,
     )
     processes: int = option(
         0,
-        "processes that collect while this one learns, for slow environments; 0: this one collects",
+        "additional processes that collect, for slow environments, while the main one learns; 0: none",
         at_least=0,
     )
     sync: bool = option(
-        True, "whether processes collect batches together, which a seed repeats, or each at its own pace"
+        True, "true: processes collect batches together, reproducible by the seed; false: independently"
     )
     ray: str | None = option(
         None, "address of a Ray cluster on whose nodes the processes collect: HOST:PORT or auto"
@@ -131,23 +133,23 @@ class ReplayConfig(Group):
         "prioritized", "prioritized or uniform sampling", choices=("prioritized", "uniform")
     )
     priority_alpha: float = option(
-        0.6, "exponent of priorities, for absolute TD errors (Schaul et al.)", at_least=0
+        0.6, "exponent alpha of the absolute TD error in priorities (Schaul et al.)", at_least=0
     )
-    priority_beta: float = option(0.4, "exponent of importance weights (Schaul et al.)", at_least=0)
+    priority_beta: float = option(0.4, "exponent beta of importance weights (Schaul et al.)", at_least=0)
     priority_beta_end: float | None = option(
         None,
-        "value that priority_beta rises to linearly until the last epoch; it stays as it is if not given",
+        "final value to which priority_beta rises linearly by the last epoch; if not given, it is constant",
         at_least=0,
     )
     device: str = option(
         "learner",
-        "where transitions are stored and relabeled: learner (where the networks are), cpu, cuda, ...",
+        "device on which transitions are stored and relabeled: learner (that of networks), cpu, cuda, ...",
     )
     buffer_size: int = option(
         1_000_000, "capacity in transitions, real and virtual ones together", at_least=1
     )
-    batch_size: int = option(256, "transitions of a gradient step", at_least=1)
-    batches_per_sample: int = option(32, "batches that are sampled in one call", at_least=1)
+    batch_size: int = option(256, "number of transitions in a gradient step", at_least=1)
+    batches_per_sample: int = option(32, "number of batches that one call of the sampler draws", at_least=1)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -164,29 +166,30 @@ class HindsightConfig(Group):
 
     algo: str = option(
         AUTO,
-        "an algorithm of `torchrl-her list`; auto: filtered_her, or cher where random actions seldom change "
-        "the achieved goal, or with the stages of curriculum=FILE",
+        "an algorithm of `torchrl-her list`; auto: filtered_her, or cher if random actions seldom change the "
+        "achieved goal or if curriculum=FILE is given",
     )
-    k: int = option(4, "virtual transitions for each real one", at_least=0)
+    k: int = option(4, "number of virtual transitions for each real one", at_least=0)
     strategy: str = option(
-        "future", "where virtual goals come from: future, final, episode, or a registered name"
+        "future", "strategy that selects virtual goals: future, final, episode, or a registered name"
     )
     goal_sources: Any = option(
         AUTO,
-        "in place of k and strategy, how many virtual goals come from where, as in '{future: 2, actual: 2}': "
-        "any strategy, actual (goals wanted in recent episodes), achieved (goals achieved in them); auto: "
-        "three future ones and two actual ones, or none if k or strategy is given",
+        "numbers of virtual goals by source, in place of k and strategy, as in '{future: 2, actual: 2}'; a "
+        "source is a strategy, actual (desired goals of recent episodes) or achieved (goals that recent "
+        "episodes achieved); auto: {future: 3, actual: 2}, or k and strategy if one of them is given",
     )
     refill: int = option(
         5,
-        "if the filter leaves transitions without goals, others get up to this multiple of k",
+        "largest number of goals of a transition, in multiples of k; above 1, goals that the filter removes "
+        "are made up for at other transitions",
         at_least=1,
     )
     redraw: bool = option(
         True,
-        "where the filter refuses a goal, draw another one that it keeps; false: store no transition for it",
+        "true: replace goals that the filter rejects by others that it keeps; false: leave them out",
     )
-    n_steps: int = option(1, "steps that a transition spans, at most (n-step returns)", at_least=1)
+    n_steps: int = option(1, "largest number of steps in a transition (n-step returns)", at_least=1)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -204,7 +207,7 @@ class HindsightConfig(Group):
 
     @property
     def sources(self) -> dict[str, int]:
-        """Number of virtual goals of each transition by source; empty if there are none."""
+        """Number of virtual goals per transition, by source; empty without virtual goals."""
         if self.goal_sources == AUTO:
             return dict(FUTURE_AND_ACTUAL)
         if self.goal_sources is not None:
@@ -220,30 +223,29 @@ class CurriculumConfig(Group):
 
     name: str = option(
         "task",
-        "task: the stages that the task itself has; or a YAML file with a list of stages",
+        "task, for the stages that the task itself defines, or a YAML file with a list of stages",
         shown_as="curriculum",
     )
-    stages: Any = option(None, "the stages themselves, as a list of their options")
+    stages: Any = option(None, "the list of stages, each a mapping of its options, in place of a file")
     guided_share: float = option(
         0.0,
-        "share of the episodes that the policy of the stage below begins, until its goal is achieved",
+        "share of the episodes that the previous stage's policy begins, until that stage's goal is achieved",
         at_least=0,
         at_most=1,
     )
     guided_per: str = option(
         "episode",
-        "whether guided_share is of episodes, or of the steps in which the goal of the stage below is not "
-        "achieved",
+        "whether guided_share is of episodes, or of steps in which the previous stage's goal is not achieved",
         choices=("episode", "step"),
     )
     alpha_actor: float = option(
-        0.0, "scale of the actor's initial weights for inputs that the first stage hides", at_least=0
+        0.0, "scale of the actor's initial weights for inputs that the first stage does not use", at_least=0
     )
-    alpha_critic: float = option(0.0, "the same scale for the critic", at_least=0)
+    alpha_critic: float = option(0.0, "the same scale as alpha_actor, for the critics", at_least=0)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.name != "task" and self.stages is None:  # a recipe holds the stages, not just their file
+        if self.name != "task" and self.stages is None:  # so that a saved recipe does not depend on the file
             object.__setattr__(self, "stages", _read_stages(Path(self.name)))
         stages = self.stages
         if stages is not None and not (
@@ -264,7 +266,7 @@ def _read_stages(path: Path) -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class DemonstrationsConfig(Group):
-    """Episodes played by another policy, from a file of `torchrl-her record`."""
+    """Use of recorded episodes of another policy, from a file that `torchrl-her record` wrote."""
 
     prefix = "demonstrations."
     needs: ClassVar[Needs] = (
@@ -274,27 +276,27 @@ class DemonstrationsConfig(Group):
         ("starts_share", bool, "starts_width starts_stride starts_threshold starts_samples"),
     )
 
-    episodes: int = option(0, "how many of the file's episodes are used, the first ones; 0: none", at_least=0)
-    file: str | None = option(None, "the file")
+    episodes: int = option(0, "number of demonstrations used, the first in the file; 0: none", at_least=0)
+    file: str | None = option(None, "file of demonstrations, written by `torchrl-her record`")
     share: float = option(
-        0.125, "share of each batch that are demonstrations; 0: none, for starts alone", at_least=0, below=1
+        0.125, "share of demonstrations in each batch; 0: only their states are used", at_least=0, below=1
     )
-    bc_weight: float = option(1.0, "weight of behavior cloning on them, in the actor's loss", at_least=0)
+    bc_weight: float = option(1.0, "weight of cloning demonstrations, in the actor's loss", at_least=0)
     q_filter: bool = option(True, "whether only actions are cloned that the critic prefers to the policy's")
     starts_share: float = option(
         0.0,
-        "share of the episodes that start at states of demonstrations, at first near their ends",
+        "share of the episodes that start at a state of a demonstration, initially near its end",
         at_least=0,
         at_most=1,
     )
-    starts_width: int = option(4, "steps of a demonstration among which such starts are drawn", at_least=1)
+    starts_width: int = option(4, "number of successive states from which such a start is drawn", at_least=1)
     starts_stride: int = option(
-        2, "steps by which they walk back from the end when these episodes succeed", at_least=1
+        2, "steps by which starts move toward the beginning when their episodes succeed", at_least=1
     )
     starts_threshold: float = option(
-        0.5, "mean success of these episodes at which starts walk back", above=0, at_most=1
+        0.5, "mean success of episodes with such starts at which starts move", above=0, at_most=1
     )
-    starts_samples: int = option(50, "episodes of which it is the mean", at_least=1)
+    starts_samples: int = option(50, "episodes whose mean success starts_threshold is for", at_least=1)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -324,41 +326,41 @@ class DemonstrationsConfig(Group):
 class EvaluationConfig(Group):
     """How runs are evaluated at the end of each epoch."""
 
-    episodes: int = option(100, "greedy episodes of each evaluation", at_least=1)
+    episodes: int = option(100, "number of greedy episodes in each evaluation", at_least=1)
     virtual_goals: bool = option(
         False,
         "whether to play extra episodes with virtual goals, and log virtual_success and virtual_q_bias",
     )
 
 
-_SEEDS = 1 << 31  # seeds are below it, to leave room for the larger seeds of evaluations
+_SEEDS = 1 << 31  # upper bound of seeds, so that seeds of evaluations can be larger numbers
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunConfig(Group):
     """Seeds, length and checkpoints of the runs."""
 
-    seed: int = option(0, "seed of everything random", at_least=0)
-    num_runs: int = option(1, "independent runs side by side; run i has the seed `seed + i`", at_least=1)
-    epochs: int = option(30, "epochs; each ends with an evaluation", at_least=1)
+    seed: int = option(0, "seed of all random numbers", at_least=0)
+    num_runs: int = option(1, "number of runs trained at once; run i has the seed `seed + i`", at_least=1)
+    epochs: int = option(30, "number of epochs; each ends with an evaluation", at_least=1)
     frames: int | None = option(
         None, "environment steps of each run, in place of epochs; rounded up to whole epochs", at_least=1
     )
-    checkpoint_interval: int = option(10, "epochs between two checkpoints", at_least=1)
-    keep_checkpoints: int = option(2, "how many of the newest checkpoints are kept", at_least=1)
+    checkpoint_interval: int = option(10, "number of epochs between two checkpoints", at_least=1)
+    keep_checkpoints: int = option(2, "number of checkpoints that are kept, the newest ones", at_least=1)
     keep_buffer: bool = option(
-        False, "whether the checkpoint of a finished run keeps the replay buffer, for more epochs later"
+        False, "whether the last checkpoint keeps the replay buffer, so that epochs can be added later"
     )
     pictures: bool = option(
-        True, "whether curves, map of goals and film of the policy are made at the end; it takes some seconds"
+        True, "whether curves, a map of goals and a film of the policy are made at the end, within seconds"
     )
     log: Any = option(
         ("tensorboard",),
-        "loggers, as [tensorboard,wandb]: tensorboard, wandb, or registered ones; [] for none besides "
-        "the table of metrics, which is always written",
+        "list of loggers, as in [tensorboard,wandb]: tensorboard, wandb, or registered ones; [] writes only "
+        "the table of metrics, which every run has",
     )
-    threads: int = option(1, "threads of torch: small networks are fastest with one", at_least=1)
-    dtype: str = option("float32", "of observations and networks", choices=("float32", "float64"))
+    threads: int = option(1, "number of torch's threads; small networks are fastest with one", at_least=1)
+    dtype: str = option("float32", "type of observations and networks", choices=("float32", "float64"))
 
     def __post_init__(self) -> None:
         super().__post_init__()

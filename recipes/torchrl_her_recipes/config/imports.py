@@ -1,9 +1,9 @@
-"""Modules of users: imports those that the user names, and refuses those that only a file names.
+"""Imports modules that the user names, and refuses modules that only a file names.
 
-A recipe can name code, as ``task=module:function`` or ``task=gym:module:ID``. Such a module is imported if
-the user named it (in :func:`~torchrl_her_recipes.make_recipe`, on the command line, by ``--import``), but not
-because a file names it: a run's folder, a policy, a preset or a study may come from another user. A module
-that only a file names needs a permission: ``with allow_imports():``, or ``--allow-import`` in a command.
+A recipe can name code, as in ``task=module:function`` or ``task=gym:module:ID``. Such a module is imported if
+the user names it: in :func:`~torchrl_her_recipes.make_recipe`, on the command line, or by ``--import``. If
+only a file names it, importing needs a permission (``with allow_imports():`` or ``--allow-import``), since
+the folder of a run, a policy, a preset or a study may come from somebody else.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from pathlib import Path
 
 from torchrl_her_envs.registry import GYM, module_of
 
-# Harmless to import for an id of gymnasium. Not for ``module:function``, which could call any function.
+# Modules that any ``gym:module:ID`` may import. ``module:function`` may not: it could call any function.
 _HARMLESS = ("gymnasium", "gymnasium_robotics", "torchrl_her_envs")
 
-_imported: list[str] = []  # modules that worker processes of studies import, too
+_imported: list[str] = []  # modules that worker processes import, too
 _permitted: set[str] = set()
 _everything: list[bool] = []  # has an entry while all modules are permitted
 
 
 def import_modules(names: Sequence[str]) -> None:
-    """Imports modules from the current folder or among the installed packages.
+    """Imports modules, given by name, from the installed packages or the current folder.
 
     Example:
         >>> import_modules(["point_tusk"])
@@ -62,7 +62,7 @@ def look_here() -> None:
 
 
 def foreign_module(task: str) -> str:
-    """Returns the module that a task imports; empty if it imports none, or a harmless one.
+    """Returns the name of the module that a task would import; empty for no module or a harmless one.
 
     Example:
         >>> foreign_module("gym:my_module:MyEnv-v0"), foreign_module("gym:FetchReach-v4")
@@ -73,7 +73,7 @@ def foreign_module(task: str) -> str:
 
 
 def needs_permission(task: str, named: Collection[str] = ()) -> bool:
-    """Returns whether a task imports a module that is neither permitted nor imported already.
+    """Returns whether a task imports a module that is neither in ``named`` nor imported already.
 
     Example:
         >>> needs_permission("package.envs:make_env"), needs_permission("package.envs:f", ["package"])
@@ -85,14 +85,14 @@ def needs_permission(task: str, named: Collection[str] = ()) -> bool:
 
 
 def permit_task(task: str) -> None:
-    """Allows the module that a task names to be imported, from now on in this process."""
+    """Permits the import of the module that a task names, until this process ends."""
     if module := foreign_module(task):
         _permitted.add(module)
 
 
 @contextmanager
 def allow_imports() -> Iterator[None]:
-    """Allows modules that only a file names to be imported, within this block.
+    """Context manager that permits the import of any module, even if only a file names it.
 
     Example:
         >>> with allow_imports():
@@ -106,7 +106,7 @@ def allow_imports() -> Iterator[None]:
 
 
 def check_permitted(task: str) -> None:
-    """Refuses a task whose module must not be imported, since only a file named it.
+    """Raises a ValueError for a task that would import a module that only a file names.
 
     Example:
         >>> check_permitted("downloaded:make_env")

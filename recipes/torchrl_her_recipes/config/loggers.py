@@ -1,4 +1,4 @@
-"""The loggers by name, which receive a run's metrics in addition to its own table."""
+"""Registry of the loggers that can receive a run's metrics, in addition to its table ``metrics.csv``."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ class LoggerSpec:
 
     Args:
         name: name of the logger, and of its folder in the run's folder.
-        factory: function that opens it, as ``module:function``; it is imported when a run begins. It is
-            called with the :class:`~torchrl_her_recipes.RunView` and a number of frames. It removes what was
-            logged after this number of frames. It returns a TorchRL ``Logger`` and the number of frames up
-            to which the rows of the metrics table are logged already: 0 for a new logger.
-        needs: the package that it needs, which is also the name of the extra; empty for none.
+        factory: function that opens the logger, as ``module:function``; imported when a run begins. It is
+            called with the :class:`~torchrl_her_recipes.RunView` and a number of frames, and removes what
+            was logged after that many frames, so that a resumed run does not log it twice. It returns a
+            TorchRL ``Logger`` and the number of frames that are logged already: 0 for a new logger.
+        needs: the package that the logger needs, which is also the name of the extra; empty for none.
     """
 
     name: str
@@ -46,7 +46,7 @@ def register_logger(spec: LoggerSpec) -> None:
 
 
 def check_loggers(value: Any) -> tuple[str, ...]:
-    """Checks the names of loggers and returns them in a tuple; it is empty for None.
+    """Checks the names of loggers and returns them as a tuple; None gives an empty tuple.
 
     Example:
         >>> check_loggers("wandb"), check_loggers(["tensorboard", "wandb"]), check_loggers(None)
@@ -74,7 +74,7 @@ def _instead(name: object) -> str:
 
 
 def check_installed(names: tuple[str, ...]) -> None:
-    """Refuses loggers whose package is missing."""
+    """Raises an ImportError if a logger needs a package that is not installed."""
     for name in names:
         needs = LOGGERS[name].needs
         if needs and find_spec(needs) is None:

@@ -1,4 +1,4 @@
-"""The metrics that can be drawn over environment steps, and the labels of their axes."""
+"""Metrics that can be drawn over environment steps, with the label and limits of each y axis."""
 
 from __future__ import annotations
 

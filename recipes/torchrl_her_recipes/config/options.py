@@ -1,4 +1,4 @@
-"""Options of a recipe: their definitions with help and allowed values, and one function that checks them."""
+"""Defines options of a recipe, with help and allowed values, and checks the values of options."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ def option(
     infinite: bool = False,
     shown_as: str = "",
 ) -> Any:
-    """Defines an option: a field of a group of options.
+    """Defines an option, as a field of a dataclass that is a group of options.
 
     Args:
         default: the value that works for most tasks; None if the task or the learner has a default of its
             own; ``AUTO`` if the value is derived from the environment before training begins.
-        help: a few words, shown by ``torchrl-her train -h``.
-        at_least, above, at_most, below: the range of a number.
-        choices: the values that are allowed.
-        infinite: whether a number may be infinite, as a limit that limits nothing.
-        shown_as: name in messages, if not the field's name.
+        help: short description, shown by ``torchrl-her train -h``.
+        at_least, above, at_most, below: allowed range of a number.
+        choices: allowed values; empty to allow any.
+        infinite: whether infinity is allowed, for an upper limit that can be switched off.
+        shown_as: name of the option in messages, if it differs from the field's name.
     """
     limits = {"at_least": at_least, "above": above, "at_most": at_most, "below": below}
     about = {"help": help, "choices": choices, "infinite": infinite, "shown_as": shown_as}
@@ -45,7 +45,7 @@ def option(
 
 
 def check_options(group: Any) -> None:
-    """Turns the values of a frozen group of options into their types, and checks their ranges."""
+    """Converts the values in a group of options to the types of the options, and checks their ranges."""
     for definition in fields(group):
         value = getattr(group, definition.name)
         if definition.default in (None, AUTO) and value == definition.default:
@@ -59,10 +59,10 @@ def check_options(group: Any) -> None:
 
 
 def idle_options(group: Any) -> dict[str, str]:
-    """Returns the options of a group that have no effect, each with the setting that is the reason.
+    """Returns the options of a group that have no effect, each with the setting that causes it.
 
-    A row of the group's ``needs`` is an option A, a function of A's value, and names of options that have an
-    effect only if the function returns a true value.
+    Each entry of the group's ``needs`` has the name of an option A, a function, and names of other options,
+    separated by spaces. The other options have an effect only if the function is true of A's value.
 
     Example:
         >>> from torchrl_her_recipes.config.groups import CollectionConfig
@@ -104,11 +104,11 @@ def _check_value(definition: Field[Any], long_name: str, value: Any) -> None:
         raise ValueError(f"{long_name} must be finite, got {value}")
 
 
-REGISTERED = "; one of your own must be registered by a module, as in torchrl-her --import MODULE"
+REGISTERED = "; to use your own, import the module that registers it: torchrl-her --import MODULE"
 
 
 def nearest(name: object, known: Any) -> str:
-    """Returns a hint for a name that was probably mistyped; empty if no name is near.
+    """Returns the hint "did you mean ...?" for a mistyped name; empty if no known name is similar.
 
     Example:
         >>> nearest("lerning_rate", ["learning_rate", "gamma"])
@@ -119,7 +119,7 @@ def nearest(name: object, known: Any) -> str:
 
 
 def what_there_is(name: object, known: Any, kind: str) -> str:
-    """Returns the end of a message about an unknown name: the nearest known one, and all of them.
+    """Returns the end of a message about an unknown name: the most similar known name, and all names.
 
     Example:
         >>> what_there_is("cherr", ["her", "cher"], "algorithms")

@@ -1,7 +1,7 @@
 """Safe reading of files from untrusted sources: text, YAML, JSON and tables.
 
-Nothing in a file is executed, and files that are too large are refused. Whatever is wrong with a file raises
-a ValueError whose message is one line and names the file.
+No content of a file is executed, and files that are too large are refused. If the content is invalid, the
+functions raise a ValueError whose message is one line and names the file.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ from typing import Any
 
 import yaml
 
-_LARGEST = 1 << 20  # bytes of a configuration, at most
+_LARGEST = 1 << 20  # largest size of a configuration in bytes
 LARGEST_TABLE = 1 << 28
 _DEPTH = 30
-# Errors that damaged content may raise in any reader. RuntimeError stands for torch's and for RecursionError.
+# Errors that damaged content may raise in any reader. RuntimeError includes torch's and RecursionError.
 _DAMAGE = (ArithmeticError, AttributeError, AssertionError, LookupError, RuntimeError, TypeError, ValueError)
-_SHOWN = 300  # characters of a reason that a message shows
+_SHOWN = 300  # largest number of characters of an error's text that a message shows
 
 
 def shown(value: object, most: int = 80) -> str:
-    """Formats a value for a message: in one line of printable characters and limited length.
+    """Formats a value for a message: one line of printable characters, at most ``most`` of them.
 
     Example:
         >>> shown({"a": "\\x1b[2J"}), shown("x" * 100, 10)
@@ -35,7 +35,7 @@ def shown(value: object, most: int = 80) -> str:
 
 
 def reason(error: BaseException | str) -> str:
-    """Formats the message of an error as the end of a line."""
+    """Formats the message of an error in one line of printable characters and limited length."""
     text = "".join(letter if letter.isprintable() else " " for letter in str(error)[: 10 * _SHOWN])
     text = " ".join(text.split()) or type(error).__name__
     return text if len(text) <= _SHOWN else f"{text[: _SHOWN - 3]}..."
@@ -43,11 +43,11 @@ def reason(error: BaseException | str) -> str:
 
 @contextmanager
 def naming(path: Path, problem: str = "cannot be read") -> Iterator[None]:
-    """Turns errors about the content of a file into a ValueError that names the file."""
+    """Context manager that turns errors about the content of a file into a ValueError naming the file."""
     try:
         yield
     except _DAMAGE as error:
-        if type(error).__name__ == "OutOfMemoryError":  # torch's, and a RuntimeError: no damage
+        if type(error).__name__ == "OutOfMemoryError":  # a RuntimeError of torch that is no fault of the file
             raise
         cause = reason(error) if isinstance(error, ValueError) else f"it is damaged ({type(error).__name__})"
         raise ValueError(f"{path} {problem}: {cause}") from error
@@ -71,7 +71,7 @@ def read_text(path: Path, *, largest: int = _LARGEST) -> str:
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML loader for plain values of limited depth, without aliases, which could expand to millions."""
+    """YAML loader for plain values of limited depth; refuses aliases, which could expand to huge values."""
 
     def __init__(self, stream: str) -> None:
         super().__init__(stream)
@@ -89,7 +89,7 @@ class _Loader(yaml.SafeLoader):
 
 
 def parse_yaml(text: str) -> Any:
-    """Parses a text in YAML to plain values.
+    """Parses YAML text into plain values.
 
     Raises:
         ValueError: the text is not YAML, or has an alias (``*name``).
@@ -115,19 +115,19 @@ def parse_yaml(text: str) -> Any:
 
 
 def read_yaml(path: Path) -> Any:
-    """Reads the content of a YAML file."""
+    """Reads a YAML file and returns its content as plain values."""
     text = read_text(path)
     with naming(path):
         return parse_yaml(text)
 
 
 def read_mapping(path: Path) -> dict[str, Any]:
-    """Reads the names and values in a YAML file."""
+    """Reads a YAML file that must hold a mapping from names to values."""
     return _mapping(path, read_yaml(path))
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Reads the names and values in a JSON file."""
+    """Reads a JSON file that must hold an object."""
     text = read_text(path)
     with naming(path):
         values = json.loads(text)
@@ -141,7 +141,7 @@ def _mapping(path: Path, values: Any) -> dict[str, Any]:
 
 
 def read_table(path: Path, *, counts: Sequence[str] = ()) -> list[dict[str, float]]:
-    """Reads the rows of a file of comma-separated numbers, by the names in its first line.
+    """Reads a CSV file of numbers; returns each row as a dict with the names in the file's first line.
 
     Args:
         path: the file.
@@ -155,7 +155,7 @@ def read_table(path: Path, *, counts: Sequence[str] = ()) -> list[dict[str, floa
             {name: number(each) for name, each in row.items()}
             for row in csv.DictReader(text.splitlines(), strict=True)
         ]
-    except (AttributeError, TypeError, ValueError, csv.Error) as error:  # cut short, or not numbers
+    except (AttributeError, TypeError, ValueError, csv.Error) as error:  # missing entries, or not numbers
         raise ValueError(f"{path} is damaged: a line is not a row of the table") from error
     for name in counts:
         if odd := [row.get(name) for row in rows if not isinstance(row.get(name), int)]:
@@ -164,5 +164,5 @@ def read_table(path: Path, *, counts: Sequence[str] = ()) -> list[dict[str, floa
 
 
 def number(text: str) -> float:
-    """Parses a number; returns an int if it is written as a whole number."""
+    """Parses a number: an int if the text consists of digits, else a float."""
     return int(text) if text.isdigit() else float(text)

@@ -1,4 +1,4 @@
-"""Descriptions of policies: plain values in the headers of their files, read without the weights."""
+"""Reads the description of a policy, plain values in the header of its file, without the weights."""
 
 from __future__ import annotations
 

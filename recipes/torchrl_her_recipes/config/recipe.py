@@ -1,4 +1,4 @@
-"""A recipe: every choice of a training run, as groups of plain values that all have defaults."""
+"""The class :class:`Recipe`, which holds all options of a training run, and functions that make recipes."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from torchrl_her_recipes.config.options import AUTO
 from torchrl_her_recipes.config.shortcuts import GROUPS, KINDS, Nested, chosen, over, place
 from torchrl_her_recipes.config.without_effect import without_effect
 
-# Options that may change when a run resumes, since they do not affect training so far.
+# Options that may change when a run is resumed, since they do not affect the training done so far.
 EXTENDING = ("epochs", "checkpoint_interval", "keep_checkpoints", "keep_buffer", "pictures", "log")
 
-# By group: an option, and other options for the same setting.
+# For each group: an option, and the options that it replaces if it is given.
 _ALTERNATIVES = {
     "run": ("frames", ("epochs",)),
     "curriculum": ("stages", ("name",)),
@@ -32,15 +32,14 @@ _ALTERNATIVES = {
 
 @dataclass(frozen=True, kw_only=True)
 class Recipe:
-    """Every choice of a training run, as groups of options with plain values.
+    """All options of a training run, as groups of plain values that have defaults.
 
-    Options that are ``auto`` get their values from the task's environment when the run is built, see
-    ``torchrl_her_recipes.config.resolve``.
-
-    :func:`make_recipe` makes one from the short names of options. Lengths are environment steps ("frames").
+    :func:`make_recipe` makes a recipe from short names of options. Options with the value ``auto`` are
+    computed from the task's environment when the run is built, see ``torchrl_her_recipes.config.resolve``.
+    Frames are environment steps.
 
     Raises:
-        ValueError: a value that cannot work or that has no effect; the message names it and what is allowed.
+        ValueError: a value is invalid or has no effect; the message names it and what is allowed.
 
     Example:
         >>> recipe = Recipe(hindsight=groups.HindsightConfig(algo="her"), run=groups.RunConfig(seed=3))
@@ -95,7 +94,7 @@ class Recipe:
 
     @property
     def total_frames(self) -> int:
-        """Environment steps of a whole run."""
+        """Number of environment steps in a whole run."""
         return self.run.epochs * self.collection.epoch_frames
 
     @property
@@ -113,11 +112,11 @@ class Recipe:
         return compose(self.to_dict(), values)
 
     def extended(self, **values: Any) -> Recipe:
-        """Returns a copy for a run that has begun, with other values of options that may change on resuming.
+        """Returns a copy for resuming a run, with new values of options that may change then.
 
         Raises:
-            ValueError: another option than ``epochs``, ``checkpoint_interval``, ``keep_checkpoints``,
-                ``keep_buffer``, ``pictures`` and ``log``.
+            ValueError: an option other than ``epochs``, ``checkpoint_interval``, ``keep_checkpoints``,
+                ``keep_buffer``, ``pictures`` and ``log`` is given.
 
         Example:
             >>> Recipe().extended(epochs=80).run.epochs
@@ -127,7 +126,7 @@ class Recipe:
         return self.replace(**values)
 
     def to_dict(self) -> Nested:
-        """Returns all values by group and name, except the name of weights that the algorithm implies."""
+        """Returns all values by group and name; omits the name of the weights if the algorithm implies it."""
         named = {group: {"name": getattr(self, group).name} for group in KINDS}
         if self.hindsight.algorithm.weights is not None:
             del named["weights"]
@@ -149,16 +148,16 @@ class Recipe:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Recipe:
-        """Makes a recipe from the values of :meth:`to_dict`, or some of them; the rest are defaults.
+        """Makes a recipe from values as :meth:`to_dict` returns them; missing values are defaults.
 
         Raises:
-            ValueError: a group or an option that does not exist, or a value that cannot work.
+            ValueError: a group or an option does not exist, or a value is invalid.
         """
         return Recipe(**_groups(place(values)))
 
 
 def check_extending(values: Mapping[str, Any]) -> None:
-    """Refuses options that would change the training that a run has done already.
+    """Raises a ValueError for options that must not change when a run is resumed.
 
     Example:
         >>> check_extending({"epochs": 80})
@@ -178,19 +177,19 @@ def check_extending(values: Mapping[str, Any]) -> None:
 def make_recipe(base: Mapping[str, Any] | None = None, /, **values: Any) -> Recipe:
     """Makes a recipe from options by name: ``make_recipe(task="hand_v0", algo="her", seed=3)``.
 
-    An option is named by itself (``gamma``) or with its group (``{"learner.gamma": 0.95}``). The groups
-    ``task``, ``learner`` and ``curriculum`` stand for their option ``name``: ``task`` for ``task.name``.
+    An option is named by itself (``gamma``) or with its group (``{"learner.gamma": 0.95}``). A group that
+    has an option ``name`` stands for it: ``task="hand_v0"`` sets ``task.name``.
 
     Args:
-        base: values of a preset or of another recipe. A value that has no effect beside ``values`` is
-            dropped, so that a preset of DDPG also serves TD3.
+        base: values of a preset or of another recipe. If ``values`` make one of them ineffective, it is
+            dropped, so that a preset for DDPG also works with TD3.
         values: options to set. An option that has no effect raises an error.
 
     Raises:
-        ValueError: an option that does not exist or that has no effect, or a value that cannot work.
+        ValueError: an option does not exist or has no effect, or a value is invalid.
 
-    A task that is named in ``values`` may import its module (``task="my_module:make_env"``); one that is
-    named in ``base`` needs a permission, see :func:`~torchrl_her_recipes.build`.
+    A task in ``values`` may import its module (``task="my_module:make_env"``); a task in ``base`` needs a
+    permission, see :func:`~torchrl_her_recipes.allow_imports`.
 
     Example:
         >>> make_recipe(task="hand_v1", algo="cher", window=5, seed=3).run.seed
@@ -218,19 +217,20 @@ def compose(base: Mapping[str, Any] | None, values: Mapping[str, Any]) -> Recipe
 
 
 def _meant(group: str, *values: Nested) -> str:
-    """Returns a group's choice, and for ``auto`` the one that it stands for on the task."""
+    """Returns the name of a group's choice; for ``auto``, the learner that it stands for on the task."""
     name, task = chosen(group, *values), chosen("task", *values)
     actions = get_task_spec(task).actions if isinstance(task, str) and name == AUTO else None
     return name if actions is None else BY_ACTIONS[actions]
 
 
 def _drop_options_of_other_choices(below: Nested, given: Nested) -> None:
-    """Drops options of the base's choices that the requested choices do not have.
+    """Drops options of the base that the choices the user requests do not have.
 
-    Defaults of the base's choice are dropped, too, since the requested choice may have other defaults.
+    If the user requests another choice than the base, defaults of the base's choice are dropped, too, since
+    the requested choice may have other defaults.
 
     Raises:
-        ValueError: the user gives an option that the choice of ``auto`` on this task does not have.
+        ValueError: the user gives an option that ``auto`` has, but not the learner it stands for on the task.
     """
     for group, kind in KINDS.items():
         asked = kind.find(chosen(group, given, below))
@@ -249,7 +249,7 @@ def _drop_options_of_other_choices(below: Nested, given: Nested) -> None:
 
 
 def _drop_options_of_another_task(below: Nested, given: Nested) -> None:
-    """Drops options of the base's task that the requested task does not take."""
+    """If the user requests another task than the base, drops task options that this task does not have."""
     name, options = given.get("task", {}).get("name"), below.get("task", {}).get("options")
     if name is None or not isinstance(options, Mapping) or name == below["task"].get("name"):
         return
@@ -258,10 +258,10 @@ def _drop_options_of_another_task(below: Nested, given: Nested) -> None:
 
 
 def drop_alternatives(below: Nested, given: Nested) -> None:
-    """Drops a setting of the base, as ``epochs``, if the user gives it by another option, as ``frames``.
+    """Drops an option of the base, such as ``epochs``, if the user gives an alternative, such as ``frames``.
 
     Raises:
-        ValueError: The user gives a setting by two options.
+        ValueError: The user gives both alternatives.
     """
     for group, (option, others) in _ALTERNATIVES.items():
         asked, base = given.get(group, {}), below.get(group, {})
@@ -278,6 +278,6 @@ def drop_alternatives(below: Nested, given: Nested) -> None:
 
 
 def _groups(values: Nested) -> dict[str, Any]:
-    """Returns the groups of a recipe, before they are checked against each other."""
+    """Makes the groups of a recipe; each group checks its own options, but not those of other groups."""
     named = {group: {"name": chosen(group, values)} for group in KINDS}
     return {group: kind(**values.get(group, {}) | named.get(group, {})) for group, kind in GROUPS.items()}

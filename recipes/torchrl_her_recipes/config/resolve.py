@@ -1,4 +1,4 @@
-"""Replaces the value ``auto`` of options by values that fit the task's environment."""
+"""Replaces the value ``auto`` of options by values computed from the task's environment."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.config.without_effect import without_effect
 
 TERMINATION = "termination"  # option of a task: the rule that ends an episode at its goal
-_WARMUP = 1_000  # least number of environment steps before learning
-_EPISODES = 100  # number in an epoch if environments are stepped one by one
-# Options of the curriculum that algo=auto chooses: all stages at once, or in sequence if goals are weighted
+_WARMUP = 1_000  # least number of environment steps before the first gradient step
+_EPISODES = 100  # episodes in an epoch if environments are stepped one by one
+# Options that algo=auto sets if it chooses a curriculum and goals have equal weights
 _AT_ONCE = {"order": "all_at_once", "every_stage": True, "task_share": 1.0}
-_STAGE_EPOCHS = 10  # most epochs of a stage below the last
+_STAGE_EPOCHS = 10  # value of stage_epochs that algo=auto sets otherwise
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,11 +26,11 @@ class EnvFacts:
     """Facts about a task's environment on which the values of ``auto`` depend.
 
     Args:
-        max_steps: steps of an episode, at most.
-        batched: whether the environments of a batch are stepped together, at little cost for each of them.
-        stages: stages of a curriculum, if the achieved goal seldom changes without one.
-        ends: rule that ends an episode at its goal, as ``task.options.termination`` takes it; None if the
-            task has no such option.
+        max_steps: largest number of steps in an episode.
+        batched: whether all environments are stepped in one call, so that each additional one costs little.
+        stages: stages of a curriculum for a task whose achieved goal random actions seldom change; else None.
+        ends: value of ``task.options.termination`` that fits the environment; None if the task has no such
+            option.
     """
 
     max_steps: int
@@ -40,7 +40,7 @@ class EnvFacts:
 
 
 def _num_envs(processes: int, facts: EnvFacts) -> int:
-    """Returns the number of environments: fewer if they are slow, to learn from each episode soon."""
+    """Returns a number of environments: few if they are slow, so that learning begins after few steps."""
     processes = max(processes, 1)
     return math.ceil((64 if facts.batched else 8) / processes) * processes
 
@@ -57,18 +57,18 @@ def _epoch_frames(collection: CollectionConfig, run: RunConfig, facts: EnvFacts)
 _VALUES: dict[str, Callable[[Recipe, EnvFacts], Any]] = {
     "algo": lambda _recipe, facts: "cher" if facts.stages else "filtered_her",
     "goal_sources": lambda recipe, _facts: recipe.hindsight.sources,
-    # so that the horizon 1 / (1 - gamma) is half an episode
+    # The horizon 1 / (1 - gamma) is half an episode.
     "gamma": lambda _recipe, facts: round(min(max(1 - 2 / facts.max_steps, 0.9), 0.99), 4),
     "num_envs": lambda recipe, facts: _num_envs(recipe.collection.processes, facts),
     "frames_per_update": lambda _recipe, facts: 5.0 if facts.batched else 1.0,
     "epoch_frames": lambda recipe, facts: _epoch_frames(recipe.collection, recipe.run, facts),
-    # at least until each environment has ended an episode: transitions are stored at an episode's end
+    # Learning begins when each environment has ended an episode: transitions are stored at an episode's end.
     "warmup_frames": lambda recipe, facts: max(recipe.collection.num_envs * facts.max_steps, _WARMUP),
 }
 
 
 def auto_options(recipe: Recipe) -> list[tuple[str, str]]:
-    """Returns group and name of each option that is ``auto``, depends on the environment, and has an effect.
+    """Returns group and name of each option whose value ``auto`` must be replaced and has an effect.
 
     Example:
         >>> auto_options(Recipe().replace(gamma=0.95))[1:3]
@@ -83,7 +83,7 @@ def auto_options(recipe: Recipe) -> list[tuple[str, str]]:
 
 
 def ends_open(task: TaskConfig) -> bool:
-    """Returns whether the environment decides what ends an episode at its goal.
+    """Returns whether the task's option ``termination`` exists and is left to the environment (``auto``).
 
     Example:
         >>> push = TaskConfig(name="gym:FetchPush-v4")
@@ -111,7 +111,7 @@ def resolve(recipe: Recipe, facts: EnvFacts) -> Recipe:
         values = {f"{group}.{name}": _VALUES[name](recipe, facts)}
         if name == "algo" and facts.stages:
             values |= {"stages": facts.stages, "guided_share": 0.5, "guided_per": "step"}
-            # Weights of goals work for one stage at a time, so that weighted goals need stages in sequence.
+            # Weights compare the goals of one stage only, so weighted goals need one stage at a time.
             values |= _AT_ONCE if recipe.weights.name == "none" else {"stage_epochs": _STAGE_EPOCHS}
         recipe = recipe.replace(**values)
     return recipe

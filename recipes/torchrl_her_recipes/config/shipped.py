@@ -1,4 +1,4 @@
-"""Presets, search spaces, studies and trained policies that come with the package, by name."""
+"""Finds presets, search spaces, studies and trained policies that come with the package, by name."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def shipped_names(kind: str) -> list[str]:
 
 
 def find_file(kind: str, name: str) -> Path:
-    """Returns the file of a preset, space or study, by its name or as the path of a YAML file.
+    """Returns the path of a preset, space or study, which is given by its name or as a YAML file.
 
     Raises:
         ValueError: there is no such file; the message lists the names that come with the package.
@@ -44,13 +44,14 @@ def preset_names() -> list[str]:
 def load_preset(name: str) -> dict[str, Any]:
     """Returns the values of a preset, by the names of options.
 
-    A preset may begin with another one (``preset: demo``), whose values it takes for options it does not set.
+    A preset can extend another preset, named in its entry ``preset``: options that it does not set have the
+    values of the other preset.
 
     Args:
         name: one of ``preset_names()``, or the path of a YAML file.
 
     Raises:
-        ValueError: there is no such preset, or it begins with itself.
+        ValueError: there is no such preset, or it extends itself.
     """
     return _load(name, ())
 
@@ -58,7 +59,7 @@ def load_preset(name: str) -> dict[str, Any]:
 def _load(name: str, above: tuple[Path, ...]) -> dict[str, Any]:
     path = find_file("preset", name)
     if path in above:
-        raise ValueError(f"the preset {name!r} begins with itself")
+        raise ValueError(f"the preset {name!r} extends itself")
     values = read_mapping(path)
     first = values.pop("preset", None)
     with naming(path):
@@ -80,7 +81,7 @@ def policy_files() -> dict[str, Path]:
 
 
 def find_policy(source: str | Path) -> Path:
-    """Returns the file of a policy, given by its path, or by the name or the task of a packaged policy.
+    """Returns the path of a policy's file; ``source`` is this path, or a name or task of a packaged policy.
 
     Raises:
         ValueError: there is no such file; the message lists the packaged policies.

@@ -1,4 +1,4 @@
-"""The names of options: short where they are unique, or with their group."""
+"""Finds options by their names, which are short (``seed``) or begin with the group (``run.seed``)."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ GROUPS: dict[str, type[groups.Group] | Kind[Any]] = {
     "run": groups.RunConfig,
 }
 KINDS = {group: kind for group, kind in GROUPS.items() if isinstance(kind, Kind)}
-# former names of options, and their present names
+# former names of options, and their present names, for messages about old recipes
 FORMER_NAMES = {
     "products": "matmul_dtype",
     "average_decay": "ema_decay",
@@ -44,26 +44,26 @@ FORMER_NAMES = {
 }
 # groups that had options before, and the groups that have them now
 FORMER = {"ibs": ("weights", "behavior"), "novelty": ("weights",), "curriculum": ("order",)}
-# groups whose options are always named with them: ``file`` alone would be unclear
+# groups whose options have no short names: ``file`` alone would be unclear
 LONG_ONLY = ("demonstrations",)
 
 
-# options that tasks of gymnasium and of users take in any case
+# options that every task of gymnasium and every user's task takes
 TASK_OPTIONS = ("max_steps", "termination", "achieved_reward", "parallel", "info_keys")
 
 
 class Entries(dict[str, Any]):
-    """Entries to set in an option that is a mapping, as ``task.options.bits=8``; its other entries stay."""
+    """Entries to set in an option that is a mapping (``task.options.bits=8``), leaving its other entries."""
 
 
 def choices_of(group: str) -> dict[str, type[groups.Group]]:
-    """Returns the classes that a group may have by name, the default first; "" names a single one."""
+    """Returns the classes of a group's choices by name, the default first; {"": class} without choices."""
     kind = GROUPS[group]
     return {kind.default: kind[kind.default], **kind} if isinstance(kind, Kind) else {"": kind}
 
 
 def option_names() -> dict[str, list[str]]:
-    """Returns the names of the options of each group; a group with choices has the options of all choices."""
+    """Returns the names of the options of each group; in a group with choices, those of all its choices."""
     names = {group: ["name"] if group in KINDS else [] for group in GROUPS}
     for group, known in names.items():
         kinds = choices_of(group).values()
@@ -77,7 +77,7 @@ def _field_names(kind: type[groups.Group]) -> list[str]:
 
 
 def chosen(group: str, *values: Nested) -> str:
-    """Returns the chosen name of a group from the first values that have one, or its default."""
+    """Returns the ``name`` (or ``algo``) of a group from the first values that set it, or its default."""
     key = "algo" if group == "hindsight" else "name"
     if name := next(filter(None, (given.get(group, {}).get(key) for given in values)), None):
         return name
@@ -106,10 +106,10 @@ def locate(name: str, *values: Nested) -> tuple[str, str]:
     """Finds the group and the name of an option.
 
     Args:
-        name: short (``seed``), with its group (``run.seed``), or a group (``task``) in place of its ``name``.
-            Options of some groups (``demonstrations.file``) have no short name.
-        values: Options that are set. If several groups have the short name, their choices decide, the first
-            values first.
+        name: short name (``seed``), name with group (``run.seed``), or a group (``task``), which stands for
+            its option ``name``. Options of some groups (``demonstrations.file``) have no short name.
+        values: Options that are set. If several groups have an option with the short name, the choices made
+            in these values decide between the groups; earlier values take precedence.
 
     Raises:
         ValueError: the option does not exist, or its short name is not unique; the message suggests names.
@@ -158,7 +158,7 @@ def locate(name: str, *values: Nested) -> tuple[str, str]:
 
 
 def split_name(name: str) -> list[str]:
-    """Splits a name into the name of an option and, if given, the name of an entry in the option's mapping.
+    """Splits a name such as ``task.options.bits`` into an option and, if given, an entry of its mapping.
 
     Example:
         >>> split_name("run.seed"), split_name("task.options.bits")
@@ -169,10 +169,11 @@ def split_name(name: str) -> list[str]:
 
 
 def place(values: Mapping[str, Any], base: Nested | None = None) -> Nested:
-    """Sorts values, by short or long names or as whole groups, into groups.
+    """Sorts values, given by short or long names or as whole groups, into groups.
 
-    If several groups have a short name, the choices in the values and in ``base`` decide, so such names are
-    placed last. If an option is given several times, the last value counts.
+    If several groups have an option with the same short name, the choices in the values and in ``base``
+    decide between the groups; such names are therefore placed last. If an option is given several times, the
+    last value counts.
 
     Example:
         >>> place({"task": "hand_v0", "seed": 3, "run": {"epochs": 2}, "task.options.bits": 8})

@@ -1,4 +1,4 @@
-"""Studies: comparisons of combinations of options, each with several seeds, and their figures."""
+"""Definition of studies, which compare combinations of options with several seeds, and their loading."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ _QUICK: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class Order:
-    """Expected order of two algorithms in a metric.
+    """Expectation that one combination of a study ends with a greater value of a metric than another.
 
     Attributes:
         measure: Metric that is compared.
-        more, less: Algorithms that are expected to have more and less of the metric.
-        text: The order as it was written.
+        more, less: Combinations that are expected to have the greater and the lesser value.
+        text: The comparison as it is written in the study.
     """
 
     measure: str
@@ -43,7 +43,7 @@ class Order:
 
     @classmethod
     def parse(cls, measure: str, text: str) -> Order:
-        """Reads an order from ``a > b`` or ``a < b``.
+        """Parses a comparison of two combinations, written ``a > b`` or ``a < b``.
 
         Example:
             >>> order = Order.parse("kl", "her_ibs < her")
@@ -58,7 +58,7 @@ class Order:
 
 
 def read_orders(expect: Mapping[str, Sequence[str]]) -> list[Order]:
-    """Returns the orders of a study's ``expect``, metric to orders.
+    """Parses a study's ``expect``, which maps metrics to lists of comparisons.
 
     Example:
         >>> [order.more for order in read_orders({"success": ["cher > her"]})]
@@ -76,28 +76,28 @@ def read_orders(expect: Mapping[str, Sequence[str]]) -> list[Order]:
 
 @dataclass(frozen=True, kw_only=True)
 class Study:
-    """A comparison of recipes.
+    """A study: a comparison of combinations of options, each trained with several seeds.
 
     Args:
         name: name of the study.
         summary: subject of the comparison, in one line.
         recipe: options that all runs have in common; ``num_runs`` is the number of seeds.
-        vary: the values that are compared, by the name of their option. All combinations are run. The
-            figure has a panel for each task, and in it a curve for each combination of the other options.
-        cases: sets of other options that are compared, by names that you choose. Each case is combined with
-            all values in ``vary``, and not with other cases. An ablation has a case for each part that it
-            takes away. Cases may not set the number or the length of runs, and each of their options must
-            have an effect in all combinations of ``vary``.
-        for_task: options of the runs on some of the tasks alone, by the task's name.
+        vary: list of values to compare for each option, by the option's name. All combinations are trained.
+            The figure has a panel for each task, with a curve for each combination of the other options.
+        cases: sets of further options to compare, by names that you choose; an ablation has a case for each
+            part that it removes. Each case is combined with all values in ``vary``, but not with other
+            cases. Cases must not set the number or the length of runs, and each of their options must have
+            an effect in all combinations of ``vary``.
+        for_task: options of the runs on one task only, by the task's name.
         figure: the metrics that are drawn over environment steps.
-        expect: orders that are expected at the end, ``a > b`` or ``a < b`` of two combinations, in lists by
-            metric. The report states for each task whether an order holds.
-        published: results of other authors, which the report shows beside the runs' results: ``numbers`` by
+        expect: expected results, as lists of comparisons ``a > b`` or ``a < b`` of two combinations, by
+            metric. The report states for each task whether they hold at the end of training.
+        published: results of other authors, which the report shows beside the study's: ``numbers`` by
             metric, task and algorithm, and ``where`` and ``notes`` by metric.
 
     Raises:
-        ValueError: there is nothing to compare, the values of an option are no list, there are options for a
-            task that is not compared, a case or a task sets an option in ``vary``, or a metric is unknown.
+        ValueError: there is nothing to compare, the values of an option are not a list, ``for_task`` names a
+            task that is not compared, a case or task sets an option in ``vary``, or a metric is unknown.
     """
 
     name: str
@@ -133,7 +133,7 @@ class Study:
         read_orders(self.expect)  # raises if an order is not valid
 
     def _check_sets(self, field: str, by: str, is_name: Callable[[str], object]) -> None:
-        """Checks a mapping to sets of options; no set may have an option that is in ``vary``."""
+        """Checks the field ``cases`` or ``for_task``, which must not set options that are in ``vary``."""
         sets = getattr(self, field)
         if not isinstance(sets, Mapping) or not all(
             isinstance(name, str) and is_name(name) and isinstance(entry, Mapping)
@@ -145,17 +145,17 @@ class Study:
                 raise ValueError(f"{field} of {self.name} must not set {both[0]} in {name}, since it varies")
 
     def combinations(self) -> Iterator[dict[str, Any]]:
-        """Yields the options that are specific to each combination, in the order of :meth:`cells`."""
+        """Yields the varied options and the case of each combination, in the order of :meth:`cells`."""
         for values in product(*self.vary.values()):
             varied = dict(zip(self.vary, values, strict=True))
             yield from ({**varied, "case": case} for case in self.cases) if self.cases else (varied,)
 
     def cells(self) -> Iterator[tuple[str, Recipe]]:
-        """Yields the name and the recipe of each combination; a recipe trains all seeds of its combination.
+        """Yields the name and the recipe of each combination; the recipe trains all seeds.
 
         Raises:
-            ValueError: a recipe cannot work, two combinations have the same name or the same recipe, or
-                a case sets an option that has no effect in one of the combinations.
+            ValueError: a recipe is invalid, two combinations have the same name or the same recipe, or a
+                case sets an option that has no effect in one of its combinations.
         """
         before: dict[str, Recipe] = {}
         for combination in self.combinations():
@@ -165,7 +165,7 @@ class Study:
             if label in before:
                 raise ValueError(f"the study {self.name} has two combinations that are called {label}")
             for_task = self.for_task.get(_task_of(combination.get("task")), {})
-            # Options of a case or in ``vary`` are never dropped silently, unlike those of the whole study.
+            # Options without effect are dropped from the shared recipe, but raise an error elsewhere.
             asked = merge(self.cases.get(case, {}), combination)
             try:
                 recipe = compose(merge(self.recipe, for_task), asked)
@@ -178,7 +178,7 @@ class Study:
 
 
 def curve_label(label: str, recipe: Recipe) -> str:
-    """Returns the name of a combination without its task, for the legend of a panel.
+    """Returns the name of a combination without its task, for the legend of the task's panel.
 
     Example:
         >>> curve_label("hand_v1_her", compose(None, {"task": "hand_v1", "algo": "her"}))
@@ -191,7 +191,7 @@ def curve_label(label: str, recipe: Recipe) -> str:
 
 
 def _word(name: str, value: Any, values: Sequence[Any]) -> str:
-    """Returns the part of a name for one of an option's ``values``; for mappings, the entries that differ."""
+    """Returns a varied option's part of a name (``tau=0.05``); for mappings, the entries that differ."""
     if all(isinstance(each, Mapping) for each in values):
         entries = {key: [each.get(key) for each in values] for key in value}
         differing = {
@@ -216,12 +216,12 @@ def load_study(
 
     Args:
         name: one of :func:`study_names`, or the path of a .yaml file.
-        seeds: runs of each combination, in place of the study's own number.
-        frames: environment steps of each run, rounded up to whole epochs.
+        seeds: number of seeds of each combination, in place of the study's own number.
+        frames: environment steps of each run, rounded up to whole epochs; None for the study's own number.
         quick: whether to shrink the study so that it ends in minutes.
 
     Raises:
-        ValueError: there is no such study, or a number below 1.
+        ValueError: there is no such study, its file is invalid, or a number is below 1.
     """
     path = find_file("study", name)
     values = read_mapping(path)
@@ -234,7 +234,7 @@ def load_study(
     with naming(path):
         study = Study(name=path.stem, **values)
         if not study.name.strip("."):
-            raise ValueError("a study has the name of its file, which must not be a bare suffix")
+            raise ValueError("a study is named after its file, which must have a name before its suffix")
         shared = merge(load_preset(preset) if preset else {}, study.recipe, asked)
         for_task = {task: merge(options, asked) for task, options in study.for_task.items()}
         study = replace(study, recipe=shared, for_task=for_task)
@@ -244,18 +244,18 @@ def load_study(
         if strange := next((name for name in named if name not in combined), None):
             labels = ", ".join(combined)
             raise ValueError(f"expect must name combinations, which are {labels}; got {strange!r}")
-    if name in study_names():  # only the package's own studies may have modules of tasks imported
+    if name in study_names():  # studies of the package are trusted, so the modules of their tasks are, too
         for _, recipe in cells:
             permit_task(recipe.task.name)
     return study
 
 
 def _set_in(options: Mapping[str, Any], names: Iterable[str]) -> list[str]:
-    """Returns the named options that ``options`` sets, by their names without the group."""
+    """Returns those of the options in ``names`` that ``options`` sets, as short names."""
     places = {locate(name) for name in names}
     return [name for group, values in place(options).items() for name in values if (group, name) in places]
 
 
 def _task_of(task: Any) -> Any:
-    """Returns the name of a task that varies, which may be given with its options."""
+    """Returns the name of a task, which is given as its name or as a mapping of task options."""
     return task.get("name") if isinstance(task, Mapping) else task

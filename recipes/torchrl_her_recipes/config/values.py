@@ -1,4 +1,4 @@
-"""Plain values: turning them into the types of options."""
+"""Converts plain values to the types of options, and names to the objects that they refer to."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torchrl_her_recipes.config.plain_files import shown
 def as_kind(name: str, value: object, kind: type) -> Any:
     """Converts a value to the type of an option.
 
-    YAML reads ``1e-3`` as text, so text that spells a number is accepted for one.
+    YAML reads ``1e-3`` as text, so text that spells a number is accepted for an option that is a number.
 
     Example:
         >>> as_kind("learning_rate", "1e-3", float), as_kind("epochs", 2.0, int)
@@ -32,7 +32,7 @@ def as_kind(name: str, value: object, kind: type) -> Any:
 
 
 def load_name(path: str) -> Any:
-    """Imports a module and returns an attribute of it, named as ``module:attribute``.
+    """Imports a module and returns one of its attributes, given as ``module:attribute``.
 
     Example:
         >>> load_name("math:floor")(2.5)

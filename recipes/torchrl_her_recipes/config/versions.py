@@ -9,7 +9,7 @@ from importlib import metadata
 from packaging.requirements import Requirement
 from packaging.version import Version
 
-# The releases that the tests were run with; `make test-versions` runs some of them again.
+# The releases that the tests were run with; `make test-versions` repeats the tests with some of them.
 TRIED = {
     "torch": ("2.14.0", "2.14.1", "2.15.0"),
     "tensordict": ("0.14.2", "0.14.3", "0.15.3"),
@@ -18,22 +18,22 @@ TRIED = {
 
 
 def own_version() -> str:
-    """Returns the installed version of this project."""
+    """Returns the installed version of the package ``torchrl-her``."""
     return metadata.version("torchrl-her")
 
 
 def check_versions(installed: Callable[[str], str] = metadata.version) -> None:
-    """Compares torch, tensordict and torchrl with the ranges that this project requires.
+    """Compares the installed torch, tensordict and torchrl with the versions that this project requires.
 
-    If the installed torch does not fit, TorchRL only warns when it is imported, and fails in the middle of a
-    run. So versions are checked first, without importing any of the three packages.
+    With an incompatible torch, TorchRL only warns when it is imported, and fails in the middle of a run.
+    Therefore, versions are checked first, without importing any of the three packages.
 
     Raises:
-        ImportError: a package is outside of its range or not installed, or tensordict is not of TorchRL's
-            minor release. The message names the package and what to install.
+        ImportError: a package is missing or outside its required range, or tensordict and TorchRL have
+            different minor releases. The message says what to install.
 
     Warns:
-        UserWarning: a package is inside of its range, but a release that was never tried.
+        UserWarning: the tests were never run with the installed release of a package.
     """
     requirements = {entry.name: entry for entry in map(Requirement, metadata.requires("torchrl-her") or [])}
     have = {name: Version(installed(name)) for name in TRIED}

@@ -1,4 +1,4 @@
-"""Finds options that have no effect beside the other options of a recipe, so that they can be refused."""
+"""Finds options that have no effect because of other options of a recipe, so that they can be refused."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from torchrl_her_recipes.config.options import idle_options
 
 
 def without_effect(groups: Any) -> dict[tuple[str, str], str]:
-    """Returns the options that have no effect, as (group, name), and the reason.
+    """Returns the options that have no effect, as (group, name), each with the reason ("with k=0").
 
     Args:
-        groups: A recipe, or any object with its groups as attributes.
+        groups: A recipe, or any object that has the groups of a recipe as attributes.
     """
     idle = {
         (group, name): why
@@ -29,7 +29,7 @@ def without_effect(groups: Any) -> dict[tuple[str, str], str]:
 
 
 def _rules(groups: Any) -> Iterator[tuple[bool, str, Iterable[str]]]:
-    """Yields rules: whether a condition holds, the condition in words, and options that it makes idle."""
+    """Yields rules: whether a condition holds, its text for messages, and options without effect then."""
     algorithm = groups.hindsight.algorithm
     learner, sources = groups.learner, groups.hindsight.sources
     takes, with_task = get_task_spec(groups.task.name).options, f"with task={groups.task.name}"

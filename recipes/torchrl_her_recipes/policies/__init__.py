@@ -1,1 +1,1 @@
-"""Trained policies: loading from runs and files, measuring, saving, exporting, showing and recording."""
+"""Trained policies: loads, measures, exports and shows them, and records their episodes."""

@@ -1,4 +1,4 @@
-"""Inputs, outputs and origin of an exported policy: plain values that need no network."""
+"""The class :class:`PolicyInfo`: inputs, outputs and origin of an exported policy, as plain values."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from torchrl_her_envs.common.goal_env import goal_env
 KEYS = ("observation", "desired_goal")
 
 _PACKAGES = ("torchrl-her", "torch", "torchrl", "tensordict")
-_WIDEST = 1 << 16  # a file with an entry or action that is wider counts as damaged
+_WIDEST = 1 << 16  # largest width of an entry or action; a file with a larger one counts as damaged
 _FLOATS = ("float32", "float64")
 _WHOLE = ("bool", *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)))
 
 
 @dataclass(frozen=True, kw_only=True)
 class PolicyInfo:
-    """Inputs and outputs of an exported policy, and the run that made it.
+    """Inputs and outputs of an exported policy, its origin and its success.
 
     Attributes:
         task: name of the task that the policy was trained on.
@@ -31,18 +31,18 @@ class PolicyInfo:
         dtype: dtype of ``observation`` and ``desired_goal``.
         action_shape: shape of one action: [width], or [] for an integer.
         action_dtype: ``"int64"`` for an integer, otherwise the dtype of the inputs.
-        task_dtype: type of the actions that the task itself takes; :meth:`Policy.predict` returns this type.
-        low, high: the least and the greatest actions that the task takes, one number for each entry.
+        task_dtype: dtype of the task's own actions, which :meth:`Policy.predict` returns.
+        low, high: the least and the greatest action of the task, one number for each entry.
         normalize_clip: bound to which normalized inputs are clipped; None if the policy does not normalize.
-            The policy normalizes inside: its inputs are the task's observations and goals as they are.
+            The policy itself normalizes: its inputs are the task's raw observations and goals.
         algorithm, learner, seed, frames: origin of the policy; frames are environment steps.
-        success: share of 1,000 greedy episodes of the task at whose last step the goal is achieved, with
-            starts and goals that no training has seen.
-        reached: share of these episodes whose goal is achieved at some step; NaN if it was not measured.
-        versions: versions of the packages that exported it; may be empty.
+        success: share of 1,000 greedy episodes that end at their goal, with starts and goals from seeds that
+            training does not use; NaN if it was not measured.
+        reached: share of these episodes that achieve their goal at some step; NaN if it was not measured.
+        versions: versions of the packages with which the policy was exported; may be empty.
 
     Raises:
-        ValueError: a value that no policy can have.
+        ValueError: a value is not valid for a policy.
 
     Example:
         >>> from torchrl_her_recipes import load_policy
@@ -75,7 +75,7 @@ class PolicyInfo:
                 raise ValueError(f"{name} of a policy must {wanted}, got {got!r}")
 
     def _checks(self) -> Iterator[tuple[str, bool, str]]:
-        """Yields the name of each value, whether the value is valid, and a description of valid ones."""
+        """Yields for each value: its name, whether it is valid, and words for what is valid ("be a name")."""
         for name in ("task", "algorithm", "learner"):
             yield name, isinstance(getattr(self, name), str), "be a name"
         for name in ("seed", "frames"):
@@ -117,12 +117,12 @@ class PolicyInfo:
         return self.task_dtype in _WHOLE
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns all values as plain data."""
+        """Returns all values by name, as plain data."""
         return asdict(self)
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> PolicyInfo:
-        """Restores the info from :meth:`to_dict`, with lists in place of tuples.
+        """Makes the info from the values of :meth:`to_dict`, in which JSON may have turned tuples into lists.
 
         Raises:
             ValueError: A value is missing, unknown or not valid.
@@ -151,7 +151,7 @@ class PolicyInfo:
             task: name of their task.
 
         Raises:
-            ValueError: they do not fit; the message describes the policy's entries and the environments'.
+            ValueError: the environments do not fit; the message lists the entries of both.
         """
         entries = describe_env(env)
         expected = {"widths": self.widths, "action_shape": self.action_shape}
@@ -159,13 +159,13 @@ class PolicyInfo:
         if {name: entries[name] for name in expected} != expected or not counts:
             offered = _words(entries["widths"], entries["action_shape"], entries["high"])
             raise ValueError(
-                f"a policy of {self.task} cannot play {task}: it has other widths, {self.expects()}, and "
+                f"a policy of {self.task} cannot play {task}: the policy has {self.expects()}, but "
                 f"{task} has {offered}"
             )
 
 
 def describe_env(env: EnvBase) -> dict[str, Any]:
-    """Returns the entries of a :class:`PolicyInfo` that follow from environments: widths, actions and limits.
+    """Returns the values of a :class:`PolicyInfo` that environments determine: widths, actions and limits.
 
     Example:
         >>> from torchrl_her_envs import make_env
@@ -190,7 +190,7 @@ def describe_env(env: EnvBase) -> dict[str, Any]:
 
 
 def present_versions() -> dict[str, str]:
-    """Returns the installed versions of this library and its main dependencies."""
+    """Returns the installed versions of this package and its main dependencies, by name."""
     return {name: version(name) for name in _PACKAGES}
 
 

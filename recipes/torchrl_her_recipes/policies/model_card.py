@@ -1,4 +1,4 @@
-"""Model cards: a page about an exported policy, written from the run that trained it."""
+"""Writes model cards: pages in Markdown about exported policies, with the command that trains them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _MARK = "<!-- written by torchrl-her export; it may be replaced by the next expo
 
 
 def card_path(policy: str | Path) -> Path:
-    """Returns the path for the model card of a policy's file, beside it.
+    """Returns the path of the model card that belongs to a policy's file: beside it, with the suffix .md.
 
     Example:
         >>> card_path("mine.onnx").name
@@ -32,17 +32,17 @@ def card_path(policy: str | Path) -> Path:
 
 
 def check_free(path: Path) -> None:
-    """Refuses to replace a page that is not a model card, or that a user has edited."""
+    """Raises a ValueError for a file that is not a model card, or whose first line a user has changed."""
     if path.exists() and not path.read_text(errors="replace").startswith(_MARK):
         raise ValueError(
-            f"{path} exists and is no model card that export wrote: choose another --out, or --no-card "
+            f"{path} exists, and export did not write it: choose another --out, or --no-card "
             "(in Python card=False)"
         )
 
 
 def write_model_card(path: Path, file: str, card: PolicyInfo, recipe: Recipe) -> None:
-    """Writes the model card of a policy."""
-    page = Environment(undefined=StrictUndefined, autoescape=False)  # Markdown; a policy's file is checked
+    """Writes the model card of a policy, which is in the file ``file`` and was trained with ``recipe``."""
+    page = Environment(undefined=StrictUndefined, autoescape=False)  # the page is Markdown, not HTML
     page.filters |= {"quote": shlex.quote, "side": _side, "tojson": json.dumps}
     text = page.from_string(_TEMPLATE.read_text()).render(
         mark=_MARK,
@@ -57,7 +57,7 @@ def write_model_card(path: Path, file: str, card: PolicyInfo, recipe: Recipe) ->
 
 
 def training_command(recipe: Recipe) -> str:
-    """Returns the command that trains a recipe.
+    """Returns the command that trains a recipe, with all options that differ from the defaults.
 
     Example:
         >>> from torchrl_her_recipes import make_recipe
@@ -75,7 +75,7 @@ def training_command(recipe: Recipe) -> str:
 
 
 def _short(group: str, name: str) -> str:
-    """Returns the name of an option, with its group if it is not unique."""
+    """Returns the short name of an option, or its name with the group if the short one is not unique."""
     try:
         return name if locate(name) == (group, name) else f"{group}.{name}"
     except ValueError:
@@ -89,5 +89,5 @@ def _text(value: Any) -> str:
 
 
 def _side(values: tuple[float, ...]) -> str:
-    """Formats the limits of actions: one number if all are the same."""
+    """Formats limits of actions as a list, or as one number if all are equal."""
     return f"{values[0]:g}" if len(set(values)) == 1 else f"[{', '.join(f'{each:g}' for each in values)}]"

@@ -1,4 +1,4 @@
-"""The network of an exported policy, made from its :class:`PolicyInfo` without the task's environments."""
+"""Makes the network of an exported policy from its :class:`PolicyInfo`, without environments of the task."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ _CONSTANTS = ("mean", "std", "limit")  # buffers of an entry's normalization
 def _action_spec(info: PolicyInfo) -> TensorSpec:
     if info.discrete:
         return Categorical(int(info.high[0]) + 1, dtype=torch.int64)
-    return Bounded(-1.0, 1.0, shape=info.action_shape, dtype=torch.float32)  # as learners' actions are
+    return Bounded(-1.0, 1.0, shape=info.action_shape, dtype=torch.float32)  # the range that learners use
 
 
 def load_network(
     info: PolicyInfo, options: LearnerConfig, weights: Mapping[str, Tensor]
 ) -> TensorDictModuleBase:
-    """Makes a greedy policy with given weights: from ``observation`` and ``desired_goal`` to ``action``.
+    """Makes a greedy policy, which reads ``observation`` and ``desired_goal`` and writes ``action``.
 
     Args:
-        info: widths of inputs and actions.
-        options: options of the learner, which define the network.
-        weights: ``state_dict()`` of the actor, with its normalization if there is one.
+        info: widths of inputs, and actions.
+        options: options of the learner, which determine the network.
+        weights: ``state_dict()`` of the actor and, if there is one, its normalization.
 
     Raises:
-        ValueError: the weights do not fit the actor; raised before memory for the actor is taken.
+        ValueError: the weights do not fit the network; this is checked before memory for it is allocated.
     """
     shape = AgentShape(
         task=info.task,
@@ -62,15 +62,15 @@ def load_network(
 
 
 def check_weights(builder: LearnerBuilder, weights: Mapping[str, Tensor]) -> None:
-    """Refuses weights that do not fit a builder's actor.
+    """Raises a ValueError if weights do not have the names and shapes of a builder's actor.
 
-    Shapes come from a file, so they are compared before memory is taken for them.
+    No memory is allocated for the actor, since the widths come from a file and may be huge.
     """
     name = builder.options.name
     shapes = {key: tuple(value.shape) for key, value in weights.items()}
     if builder.options.depth > len(weights):
         raise ValueError(f"these are not the weights of an actor of learner={name}")
-    with torch.device("meta"):  # without memory: only the shapes matter
+    with torch.device("meta"):  # tensors without memory, since only the shapes are needed
         actor = builder.player(1)
         expected = {
             key: tuple(value.shape) for key, value in acting(actor, builder.norm()).state_dict().items()
@@ -86,7 +86,7 @@ def check_weights(builder: LearnerBuilder, weights: Mapping[str, Tensor]) -> Non
 
 
 class ScaledActions(nn.Module):
-    """A network whose actions are scaled from [-1, 1] to a task's bounds.
+    """Module that scales the actions of a network from [-1, 1] to a task's bounds.
 
     Args:
         net: network whose actions [..., actions] are from -1 to 1.
@@ -109,17 +109,17 @@ class ScaledActions(nn.Module):
     def forward(self, *inputs: Tensor) -> Tensor:
         """Maps inputs [..., width] to actions [..., actions]."""
         action = self.middle + self.reach * self.net(*inputs)
-        return action.minimum(self.high).maximum(self.low)  # rounding may exceed the bounds
+        return action.minimum(self.high).maximum(self.low)  # by rounding, actions may exceed the bounds
 
 
 class TensorPolicy(nn.Module):
-    """A policy as a function of tensors alone, in float32, with its normalization inside.
+    """A policy as a module on plain tensors, in float32, which includes the normalization of inputs.
 
     Args:
         policy: policy from :func:`load_network`; it is copied.
 
     Attributes:
-        net: the network behind the normalization.
+        net: the network, which reads normalized inputs.
 
     Example:
         >>> from torchrl_her_recipes import load_policy
@@ -139,7 +139,7 @@ class TensorPolicy(nn.Module):
                     self.register_buffer(f"{key}_{name}", value)
 
     def normalized(self, *inputs: Tensor) -> list[Tensor]:
-        """Returns the network's input for an observation and a desired goal."""
+        """Returns an observation and a desired goal as inputs of the network, normalized if it normalizes."""
         if not self.normalizes:
             return list(inputs)
         constants = [[getattr(self, f"{key}_{name}") for name in _CONSTANTS] for key in KEYS]
@@ -151,21 +151,21 @@ class TensorPolicy(nn.Module):
 
     @torch.no_grad()
     def deviation(self, action: Tensor, observation: Tensor, desired_goal: Tensor) -> Tensor:
-        """Returns how far given actions are from this policy's actions, [rows].
+        """Returns how far given actions are from the actions of this policy, [rows].
 
-        For continuous actions it is the greatest difference of an entry. For integers it is the difference
-        between the values of the best action and the given one, since two actions may have the same value.
+        For continuous actions, this is the greatest difference of an entry. For integers, it is the
+        difference in value between the best and the given action, since several actions may be best.
         """
         inputs = self.normalized(observation, desired_goal)
         if not action.is_floating_point():
-            if not hasattr(self.net, "regret"):  # a network of a user's learner
+            if not hasattr(self.net, "regret"):  # networks of users' learners may not have this method
                 return (action != self.net(*inputs)).float()
             return self.net.regret(action, *inputs)
         return (action - self.net(*inputs)).abs().amax(-1)
 
 
 def _constants(norm: RunningNorm, key: str) -> tuple[Tensor, Tensor, Tensor]:
-    """Returns mean, deviation and limit of an entry, as :meth:`RunningNorm.normalize` uses them."""
+    """Returns an entry's mean, standard deviation and limit, by which :class:`RunningNorm` normalizes it."""
     n, mean, _ = norm.moments_of(key)
     std = norm.std[0, norm.columns_of(key)]
     limit = torch.where(n > 0, norm.clip, torch.inf)

@@ -1,8 +1,8 @@
-"""Policies as ONNX files for onnxruntime, checked against the policy itself when they are written.
+"""Writes policies as ONNX files, and checks that onnxruntime returns the policy's actions with them.
 
-torch has two exporters. The one over ``torch.export`` (``dynamo=True``) is maintained and converts all
-networks of this library; the older one over TorchScript is deprecated and fails at layer normalization over
-a width that depends on the input's shape.
+Of torch's two exporters, this module uses the one based on ``torch.export`` (``dynamo=True``), which is
+maintained and converts all networks of this library. The older one, based on TorchScript, is deprecated and
+fails at layer normalization over a width that depends on the input's shape.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from torchrl_her_recipes.policies.info import KEYS, PolicyInfo
 from torchrl_her_recipes.policies.network import TensorPolicy
 
 SUFFIX = ".onnx"
-TOLERANCE = 1e-5  # greatest difference of actions; relative to the greatest action if that is above 1
+TOLERANCE = 1e-5  # largest allowed difference of actions, relative to the largest action if it is above 1
 
-_OPSET = 18  # the lowest version that torch's exporter writes by itself; runtimes have it since 2023
+_OPSET = 18  # the lowest version that torch's exporter writes without conversion; in runtimes since 2023
 
 
 def need_onnx() -> ModuleType:
-    """Returns the package ``onnxruntime``, if all packages for writing ONNX files are installed."""
+    """Returns the package ``onnxruntime``; raises an ImportError if a package for ONNX files is missing."""
     try:
-        # Imported here, since these packages are an extra that few users need, and take a second to import.
+        # Imported here, since few users need these packages, which are an extra and take a second to import.
         import onnx  # noqa: F401, PLC0415
         import onnxruntime  # noqa: PLC0415
         import onnxscript  # noqa: F401, PLC0415
@@ -54,27 +54,26 @@ def write_onnx(
     *,
     states: TensorDictBase,
 ) -> PolicyInfo:
-    """Writes a policy as an ONNX file, which maps any number of rows to actions, in float32.
+    """Writes a policy as an ONNX file, in float32, for any number of rows.
 
-    The graph has the inputs ``observation`` [batch, width] and ``desired_goal`` [batch, width] and the output
-    ``action`` [batch, width], or integers [batch]. Normalization and the scaling of actions are inside.
-    ``info`` and ``recipe`` are in the file's metadata, as JSON.
+    The graph has the inputs ``observation`` [batch, width] and ``desired_goal`` [batch, width], and the
+    output ``action`` [batch, width], or [batch] of integers. It includes normalization and the scaling of
+    actions. The file's metadata contain ``info`` and ``recipe`` as JSON.
 
-    The file is written under another name first. It is renamed when onnxruntime has returned the policy's
-    actions with it.
+    The file gets its name only when onnxruntime has returned the policy's actions with it.
 
     Args:
-        policy: The network of :func:`~torchrl_her_recipes.policies.network.load_network`.
+        policy: Policy from :func:`~torchrl_her_recipes.policies.network.load_network`.
         info: Inputs, outputs and origin of the policy.
-        recipe: Values of the recipe of the run that trained it.
-        path: The file.
-        states: Rows of ``observation`` and ``desired_goal`` on which the actions are compared.
+        recipe: Recipe of the run that trained the policy, as plain values.
+        path: Path of the file.
+        states: Rows of ``observation`` and ``desired_goal`` on which actions are compared.
 
     Returns:
-        The info about the policy as it is in the file.
+        The info that the file contains, with the dtypes of the ONNX graph.
 
     Raises:
-        ValueError: onnxruntime gives other actions.
+        ValueError: onnxruntime returns other actions.
         ImportError: onnx, onnxruntime or onnxscript is missing.
         OSError: The file cannot be written.
     """
@@ -96,22 +95,22 @@ def write_onnx(
 def _check_actions(module: TensorPolicy, action: Tensor, info: PolicyInfo, inputs: dict[str, Tensor]) -> None:
     """Raises a ValueError if actions differ from the policy's by more than :data:`TOLERANCE`.
 
-    For integers, the values of actions are compared, since two actions may have the same value.
+    See :meth:`TensorPolicy.deviation` for the difference of actions that are integers.
     """
     worst = float(module.deviation(action, *inputs.values()).nan_to_num(torch.inf).max())
     scale = max([1.0, *(abs(side) for side in (*info.low, *info.high) if abs(side) < float("inf"))])
     limit = TOLERANCE * (1.0 if info.discrete else scale)
     if not worst <= limit:
         raise ValueError(
-            f"the ONNX file would not act as the policy of {info.task} does: on {len(action):,} states of "
-            f"the task, onnxruntime's actions differ by up to {worst:.1e}, more than {limit:.0e}; it was "
-            "removed"
+            f"the ONNX file was removed, since it does not act like the policy of {info.task}: on "
+            f"{len(action):,} states of the task, onnxruntime's actions differ by up to {worst:.1e}, "
+            f"more than {limit:.0e}"
         )
 
 
 def _graph_of(module: TensorPolicy, info: PolicyInfo) -> Any:
-    """Converts the policy to a protobuf without traces of the machine that made it."""
-    inputs = tuple(torch.zeros(2, info.widths[key]) for key in KEYS)  # torch takes a size of 1 for a constant
+    """Converts a policy to an ONNX protobuf, without paths and stack traces of this machine."""
+    inputs = tuple(torch.zeros(2, info.widths[key]) for key in KEYS)  # a batch size of 1 would become fixed
     batch = torch.export.Dim("batch")
     with _silent():
         program = torch.onnx.export(
@@ -138,13 +137,13 @@ def _graph_of(module: TensorPolicy, info: PolicyInfo) -> Any:
 
 @contextmanager
 def _silent() -> Iterator[None]:
-    """Suppresses notices of torch's exporter that do not concern the policy."""
+    """Context manager that suppresses messages of torch's exporter that do not concern the policy."""
     log = logging.getLogger("torch.onnx")
     level = log.level
     log.setLevel(logging.ERROR)  # suppresses a notice that torchvision is missing
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # warnings about equal batch sizes and deprecated calls
+            warnings.simplefilter("ignore")  # they are about equal batch sizes and deprecated calls
             yield
     finally:
         log.setLevel(level)

@@ -1,4 +1,4 @@
-"""Trained policies: loaded from runs, from files, or from those that come with the package."""
+"""The class :class:`Policy`, a trained policy from a run, a file or the package, and its export."""
 
 from __future__ import annotations
 
@@ -36,24 +36,25 @@ from torchrl_her_recipes.runs.folder import RunFolder
 from torchrl_her_recipes.runs.policy_file import read_policy, write_policy
 from torchrl_her_recipes.runs.scores import median_run
 
-_MEASURED = 1 << 41  # seeds that no training uses: for episodes that measure a policy,
-_COMPARED = 1 << 42  # and for those on whose states an ONNX file is compared with it
+_MEASURED = 1 << 41  # seed of episodes that measure a policy; no training uses it
+_COMPARED = 1 << 42  # seed of episodes on whose states an ONNX file is compared with its policy
 
 
 class Policy(TensorDictModuleBase):
     """A trained greedy policy: reads ``observation`` and ``desired_goal``, writes ``action``.
 
-    It acts in TorchRL's environments and collectors and in :func:`~torchrl_her.evaluate`. For gymnasium's
-    arrays it has :meth:`predict`.
+    It can act in TorchRL's environments and collectors and in :func:`~torchrl_her.evaluate`; :meth:`predict`
+    takes arrays of gymnasium.
 
     Args:
         info: Inputs, actions and success of the policy.
-        recipe: Recipe of the run that trained it, with this run's seed only. Its task may be a harder one.
-        weights: Weights of the run's actor, with its normalization if there is one.
-        source: Name, folder or file that the policy was loaded from.
+        recipe: Recipe of the run that trained the policy, for this run's seed only. Its task can differ from
+            ``info.task``, for which the policy was exported.
+        weights: Weights of the run's actor and, if there is one, its normalization.
+        source: Name, folder or file from which the policy was loaded.
 
     Raises:
-        ValueError: The weights do not fit the actor that info and recipe describe.
+        ValueError: The weights do not fit the actor that ``info`` and ``recipe`` describe.
 
     Example:
         >>> policy = Policy.load("hand_v1")
@@ -85,11 +86,11 @@ class Policy(TensorDictModuleBase):
         its task.
 
         Args:
-            source: Name of a policy that comes with the package, or of its task, a ``.safetensors`` file that
-                :meth:`save` wrote, the folder of a run, or the file of a policy in it.
-            run: Index of the run, if the folder has several side by side; the run with the median success
-                if None.
-            best: Whether to take the policy of the evaluation with the best median success, not the last.
+            source: Name or task of a policy that comes with the package, a ``.safetensors`` file that
+                :meth:`save` wrote, the folder of a run, or a policy's file in this folder.
+            run: Index of the run, if the folder has several runs side by side; by default, the run with the
+                median success.
+            best: Whether to load the policy with the best success in an evaluation instead of the last one.
 
         Raises:
             ValueError: There is no such policy or run, the file is damaged, ``run`` or ``best`` is given for
@@ -119,7 +120,7 @@ class Policy(TensorDictModuleBase):
             )
         with naming(path, "is not an exported policy"):
             info, recipe = PolicyInfo.from_dict(described["info"]), Recipe.from_dict(described["recipe"])
-            if path in policy_files().values():  # this package's own files may name modules
+            if path in policy_files().values():  # files of the package are trusted to name a task's module
                 permit_task(info.task)
             return cls(info, recipe, weights, str(source))
 
@@ -152,7 +153,7 @@ class Policy(TensorDictModuleBase):
             versions=present_versions(),
         )
         curriculum, width = make_curriculum(envs.curriculum, env), sum(info.widths.values())
-        # positions of the network's inputs in the concatenated observation and desired goal
+        # For each input of the network, its position in the concatenated observation and desired goal
         places = torch.arange(width)
         if curriculum is not None:
             last = curriculum.state_index[-1]
@@ -162,22 +163,22 @@ class Policy(TensorDictModuleBase):
             return cls(info, recipe.replace(num_runs=1, seed=info.seed), weights, source)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes ``action`` [..., width], or integers [...] where actions are discrete."""
+        """Writes ``action``: [..., width], or [...] of integers if actions are discrete."""
         return self.module(tensordict)
 
     @torch.no_grad()
     def predict(self, observation: Mapping[str, np.ndarray], **_kwargs: Any) -> tuple[np.ndarray, None]:
-        """Returns actions for one observation of gymnasium's or for several, like Stable-Baselines3's method.
+        """Returns actions for one or several observations of gymnasium, like Stable-Baselines3's ``predict``.
 
         Args:
             observation: Arrays ``observation`` and ``desired_goal``, [width] or [n, width]; other entries are
                 not read.
-            _kwargs: Arguments of Stable-Baselines3, as ``deterministic`` and ``state``. They have no effect:
-                the policy is greedy and has no state.
+            _kwargs: Arguments of Stable-Baselines3, such as ``deterministic`` and ``state``, which have no
+                effect: the policy is greedy and has no state.
 
         Returns:
-            The action, [width] or [n, width], within the task's own bounds and of its type; and None in place
-            of a recurrent state.
+            The action, [width] or [n, width], in the task's bounds and dtype; and None, where
+            Stable-Baselines3 returns a recurrent state.
 
         Example:
             >>> import gymnasium, torchrl_her_envs
@@ -208,12 +209,12 @@ class Policy(TensorDictModuleBase):
 
         Args:
             number: Number of environments.
-            seed: Seed of their starts and goals.
-            pictures: Whether the environments render pictures, if they can.
+            seed: Seed of starts and goals.
+            pictures: Whether environments that can render pictures are made so that they do.
 
         Raises:
-            ValueError: The environments differ from those that the policy was trained on, or the task names a
-                module that must not be imported.
+            ValueError: The environments have other observations, goals or actions than the policy, or the
+                task names a module that must not be imported.
         """
         envs = TaskEnvs.of(self.recipe.replace(task=self.info.task))
         env = envs.make(number, [seed], pictures=pictures, scaled=False)
@@ -221,7 +222,7 @@ class Policy(TensorDictModuleBase):
         return env
 
     def measure(self, episodes: int = 1_000, *, seed: int = _MEASURED) -> tuple[float, float]:
-        """Returns the shares of episodes whose goal is achieved at the last step, and at some step."""
+        """Plays episodes; returns the shares whose goal is achieved at the last step, and at some step."""
         with closing(self.envs(evaluation_envs(self.info.task, episodes), seed=seed)) as env:
             rollout = play_episodes(env, self, episodes)
             at_last, at_some = (
@@ -230,20 +231,19 @@ class Policy(TensorDictModuleBase):
         return float(at_last), float(at_some)
 
     def save(self, path: str | Path, *, card: bool = True) -> None:
-        """Writes the policy as a file: for :meth:`load` if its suffix is ``.safetensors``, for onnxruntime if
-        it is ``.onnx``.
+        """Writes the policy to a ``.safetensors`` file, for :meth:`load`, or ``.onnx`` file, for onnxruntime.
 
-        An ONNX file is removed unless onnxruntime returns the policy's actions with it, to 1e-5, on states
-        of the task.
+        An ONNX file is checked: on states of the task, onnxruntime must return the policy's actions with it,
+        up to 1e-5. Otherwise the file is removed.
 
         Args:
-            path: The file.
-            card: Whether a model card is written beside the file, with the suffix ``.md``.
+            path: Path of the file; its suffix determines the format.
+            card: Whether to write a model card beside the file, with the suffix ``.md``.
 
         Raises:
-            ValueError: The suffix is another one, the card would replace a page that is not a model card, or
-                the actions of the ONNX file differ from the policy's.
-            ImportError: The suffix is ``.onnx``, and the extra ``onnx`` is missing.
+            ValueError: The suffix is unknown, the card would replace a page that is not a model card, or the
+                ONNX file does not pass the check.
+            ImportError: The suffix is ``.onnx``, but the extra ``onnx`` is not installed.
             OSError: The file cannot be written.
         """
         path, info = Path(path), self.info
@@ -275,24 +275,24 @@ def export_policy(
     best: bool = False,
     card: bool = True,
 ) -> Policy:
-    """Measures the policy of a run on 1,000 episodes, and writes it to a small file and a page about it.
+    """Loads a policy, measures its success in 1,000 episodes, and writes it to a file with a model card.
 
     Args:
-        source: The policy, as for :meth:`Policy.load`.
-        out: The file; its suffix ``.safetensors`` or ``.onnx`` is its format, see :meth:`Policy.save`.
-        run: Index of the run, if the folder has several side by side; the run with the median success if
-            None.
-        task: Name of the task that the policy is for, if not the run's own. Its observations, goals and
-            actions must have the same widths.
-        best: Whether to take the policy of the evaluation with the best median success, not the last.
-        card: Whether a model card is written beside the file, with the suffix ``.md``.
+        source: Run, file or name of the policy, see :meth:`Policy.load`.
+        out: Path of the file, with the suffix ``.safetensors`` or ``.onnx``, see :meth:`Policy.save`.
+        run: Index of the run, if the folder has several runs side by side; by default, the run with the
+            median success.
+        task: Name of the task for which the policy is exported; by default, the task of its run.
+            Observations, goals and actions of both tasks must have the same widths.
+        best: Whether to export the policy with the best success in an evaluation instead of the last one.
+        card: Whether to write a model card beside the file, with the suffix ``.md``.
 
     Returns:
         The policy that was written.
 
     Raises:
-        ValueError: See :meth:`Policy.load` and :meth:`Policy.save`, or the policy cannot play the task.
-        ImportError: The suffix is ``.onnx``, and the extra ``onnx`` is missing.
+        ValueError: See :meth:`Policy.load` and :meth:`Policy.save`; or the policy does not fit the task.
+        ImportError: The suffix is ``.onnx``, but the extra ``onnx`` is not installed.
         OSError: The run has not saved a policy yet, or the file cannot be written.
     """
     out = Path(out)
@@ -300,7 +300,7 @@ def export_policy(
     policy = Policy.load(source, run=run, best=best)
     info = replace(policy.info, task=task or policy.info.task, versions=present_versions())
     if task is not None:
-        permit_task(task)  # named by the caller
+        permit_task(task)  # the caller names this task, and not just a file
         with closing(TaskEnvs.of(policy.recipe.replace(task=task)).make(1, [0], scaled=False)) as env:
             policy.info.check_plays(env, task)
     measured = info.task == policy.info.task and not math.isnan(info.success)
@@ -313,7 +313,7 @@ def export_policy(
 
 
 def _check_out(path: Path, *, card: bool) -> None:
-    """Refuses a file that cannot be written, before any long computation."""
+    """Checks the suffix, the model card and the packages of an export, before any long computation."""
     if path.suffix not in (POLICY_SUFFIX, SUFFIX):
         raise ValueError(f"a policy's file must end with {POLICY_SUFFIX} or {SUFFIX}, got {path.name!r}")
     if card:
@@ -323,11 +323,11 @@ def _check_out(path: Path, *, card: bool) -> None:
 
 
 def _as_shown(actor: dict[str, Tensor], places: Tensor, width: int) -> dict[str, Tensor]:
-    """Returns an actor's weights for the inputs in another order; inputs that it does not use get weight 0.
+    """Converts an actor's weights to another order of inputs; new inputs get the weight 0.
 
     Args:
         actor: Weights of the actor and its normalization.
-        places: New position of each input.
+        places: Position of each of the actor's inputs in the new order.
         width: Number of inputs in the new order.
     """
     moved = dict(actor)

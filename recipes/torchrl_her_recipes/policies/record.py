@@ -1,4 +1,4 @@
-"""Recording demonstrations: episodes of a scripted controller or of a trained policy, as a file."""
+"""Records demonstrations: episodes of a scripted controller or of a trained policy, in a file."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from torchrl_her_recipes.config.recipe import make_recipe
 from torchrl_her_recipes.policies.policy import Policy
 
 EXPERT = "expert"
-_AT_ONCE, _OF_GYM_AT_ONCE = 100, 10  # environments that are stepped together
-_MOST = 10  # at most this number of episodes is played for each requested one
+_AT_ONCE, _OF_GYM_AT_ONCE = 100, 10  # largest numbers of environments, in general and for gymnasium's
+_MOST = 10  # largest number of episodes that are played, per requested episode
 
 
 @dataclass(frozen=True)
@@ -29,9 +29,9 @@ class Recorded:
     """Result of a recording.
 
     Attributes:
-        demonstrations: contents of the file.
-        played: number of episodes that were played for it.
-        achieved: number of these episodes that achieved their goal.
+        demonstrations: the demonstrations in the file.
+        played: number of episodes that were played.
+        achieved: number of played episodes that achieved their goal.
     """
 
     demonstrations: Demonstrations
@@ -49,26 +49,26 @@ def record_demonstrations(
     keep_all: bool = False,
     force: bool = False,
 ) -> Recorded:
-    """Plays episodes of a task and writes those that achieve their goal into a file.
+    """Plays episodes of a task and writes those that achieve their goal to a file.
 
-    The file also holds the physical states of this library's own environments, so that episodes can start
-    there. :meth:`~torchrl_her.demonstrations.Demonstrations.load` reads it.
+    For this library's own environments, the file also has their physical states, from which episodes can
+    start. :meth:`~torchrl_her.demonstrations.Demonstrations.load` reads the file.
 
     Args:
         task: name of the task.
         out: file for the demonstrations.
 
     Keyword Args:
-        episodes: number of episodes to write; at most ten times as many are played.
-        policy: ``"expert"``, which is the task's scripted controller; the name of a trained policy that comes
-            with the package; or the file of an exported one. None: the scripted controller.
+        episodes: number of episodes to write; at most ten times this number is played.
+        policy: policy that plays: ``"expert"`` or None for the task's scripted controller, or a trained
+            policy as for :meth:`Policy.load`.
         seed: seed of starts and goals.
-        keep_all: whether episodes that fail are written, too; then no more than ``episodes`` are played.
-        force: whether an existing file is replaced.
+        keep_all: whether to write all played episodes, even if they fail; then only ``episodes`` are played.
+        force: whether to replace an existing file.
 
     Raises:
-        ValueError: there is no such task or policy, the policy is for another kind of task, the file exists,
-            or the policy hardly ever achieves a goal.
+        ValueError: there is no such task or policy, the policy does not fit the task, the file exists, or too
+            few episodes achieve their goal.
         OSError: the file cannot be written.
     """
     if episodes < 1:
@@ -91,8 +91,8 @@ def _find_policy(task: str, env: EnvBase, policy: str | Path | None) -> tuple[Pl
             return make_controller(env), "the scripted controller"
         except TypeError:
             raise ValueError(
-                f"{task} has no scripted controller: give --policy (policy=...), a file that `torchrl-her "
-                "export` wrote or the name of a trained policy"
+                f"{task} has no scripted controller: give another --policy (policy=...), which is a file "
+                "that `torchrl-her export` wrote or the name of a trained policy"
             ) from None
     trained = Policy.load(policy)
     trained.info.check_plays(env, task)
@@ -102,14 +102,14 @@ def _find_policy(task: str, env: EnvBase, policy: str | Path | None) -> tuple[Pl
 def _play(
     env: EnvBase, player: Player, name: str, episodes: int, *, keep_all: bool, facts: dict[str, Any]
 ) -> Recorded:
-    """Plays episodes one after the other in each environment, until there are enough to write."""
+    """Plays episodes in rounds, one per environment and round, until there are enough to write."""
     reward, parts = reward_range(goal_env(env))[1], []
     kept = played = achieved = 0
     while kept < episodes and played < _MOST * episodes:
         batch = demonstrate(env, player, max_steps=goal_env(env).max_steps, achieved_reward=reward)
         batch = batch.select(range(min(len(batch), (episodes if keep_all else _MOST * episodes) - played)))
         good = batch.achieved.nonzero().flatten()
-        if not keep_all and len(good) >= episodes - kept:  # later episodes are dropped
+        if not keep_all and len(good) >= episodes - kept:  # episodes after the last one needed are dropped
             good = good[: episodes - kept]
             batch = batch.select(range(int(good[-1]) + 1))
         played, achieved = played + len(batch), achieved + len(good)
@@ -119,7 +119,7 @@ def _play(
     if kept < episodes:
         raise ValueError(
             f"only {achieved} of {played} episodes of {name} by {facts['policy']} achieved their goal: "
-            "choose another policy, fewer --episodes, or --all, which keeps those that fail"
+            "choose another policy, fewer --episodes, or --all, which also writes episodes that fail"
         )
     made_by = {**facts, "played": played, "achieved": achieved}
     return Recorded(replace(Demonstrations.join(parts), task=name, made_by=made_by), played, achieved)

@@ -1,4 +1,4 @@
-"""Shows policies that act side by side: as pictures, and as a video."""
+"""The class :class:`Viewer`, which plays policies side by side and makes pictures and videos of them."""
 
 from __future__ import annotations
 
@@ -18,31 +18,33 @@ from torchrl_her_recipes.config.groups import TaskConfig
 from torchrl_her_recipes.policies.policy import Policy
 from torchrl_her_recipes.runs.film import FPS
 
-_GAP = 8  # pixels between policies
-_HOLD = 25  # number of times that a video repeats its last frame
+_GAP = 8  # width in pixels of the gap between two policies
+_HOLD = 25  # number of times that the last frame of a video is repeated
 
 
 class Seen(NamedTuple):
-    """Number of goals that a policy achieved, and number of all goals that it had."""
+    """Number of goals that a policy achieved, and number of its goals in all episodes that ended."""
 
     achieved: int
     goals: int
 
 
 class Viewer:
-    """Shows policies on the same starts and goals, side by side. As a context, it closes their environments.
+    """Plays policies side by side on the same starts and goals, and makes pictures of them.
+
+    Use it as a context manager, which closes the environments.
 
     Args:
         policies: The policies, all of the same task.
 
     Keyword Args:
-        goals: Number of goals, side by side.
+        goals: Number of goals, and of episodes of each policy, that are shown side by side.
         seed: Seed of goals and starts.
-        size: Pixels of one environment.
-        named: Whether names and successes are written below the pictures.
+        size: Width and height of each environment's picture in pixels.
+        named: Whether names and successes of the policies are written below the pictures.
 
     Raises:
-        ValueError: The policies are of different tasks, or an environment gives no pictures.
+        ValueError: The policies are of different tasks, or an environment cannot render pictures.
     """
 
     def __init__(
@@ -64,7 +66,7 @@ class Viewer:
                 env = policy.envs(goals, seed=seed, pictures=True)
                 opened.callback(env.close, raise_if_closed=False)
                 if not goal_env(env).can_render:
-                    raise ValueError(f"{policy.source} cannot be filmed: its environment gives no pictures")
+                    raise ValueError(f"{policy.source} cannot be filmed: its environment renders no pictures")
                 self._episodes.append(LiveEpisodes(env, policy, size=size))
             self._opened = opened.pop_all()
         self._before = [Seen(0, 0)] * len(self._episodes)  # counts of earlier episodes
@@ -78,32 +80,32 @@ class Viewer:
 
     @property
     def running(self) -> bool:
-        """Whether an episode is still open."""
+        """Whether an episode has not ended yet."""
         return any(episodes.running for episodes in self._episodes)
 
     @property
     def step_count(self) -> int:
-        """Steps since the start of the present episodes."""
+        """Number of steps since the start of the current episodes."""
         return max(episodes.step_count for episodes in self._episodes)
 
     @property
     def max_steps(self) -> int:
-        """Largest number of steps of an episode."""
+        """Largest number of steps in an episode."""
         return self._episodes[0].max_steps
 
     @property
     def first_goal(self) -> int:
-        """Number of the first goal that is shown, counted from 1."""
+        """Number of the first goal that is shown now, counting all goals since the beginning from 1."""
         return self._round * self.goals + 1
 
     @property
     def desired_goal(self) -> Tensor:
-        """Goals [goals, g], in the coordinates of the first policy."""
+        """The current goals [goals, g], from the environments of the first policy."""
         return self._episodes[0].desired_goal
 
     @property
     def seen(self) -> list[Seen]:
-        """Number of achieved goals and of ended episodes of each policy, since the first start."""
+        """For each policy, numbers of achieved goals and of ended episodes since the beginning."""
         pairs = zip(self._before, self._episodes, strict=True)
         return [
             Seen(before.achieved + episodes.achieved, before.goals + episodes.worlds - len(episodes.running))
@@ -111,7 +113,7 @@ class Viewer:
         ]
 
     def start(self) -> None:
-        """Begins episodes with the next goals; open episodes are dropped and do not count."""
+        """Begins episodes with the next goals; unfinished episodes are dropped and not counted."""
         if self._round >= 0:
             self._before = self.seen
         self._round += 1
@@ -119,12 +121,12 @@ class Viewer:
             episodes.start(seed=self.seed + self._round)
 
     def step(self) -> None:
-        """Takes a step with each policy that has open episodes."""
+        """Takes a step in the unfinished episodes of each policy."""
         for episodes in self._episodes:
             episodes.step()
 
     def frame(self) -> Tensor:
-        """Returns the present picture [height, width, 3] of uint8."""
+        """Returns the current picture of all policies, [height, width, 3] of uint8."""
         if self._labels is None:
             return beside([episodes.frame for episodes in self._episodes], gap=_GAP)
         rows = zip(self._episodes, self._labels, self.seen, strict=True)
@@ -137,13 +139,13 @@ class Viewer:
         )
 
     def write(self, out: str | Path) -> list[Seen]:
-        """Writes a film of one episode for each goal.
+        """Plays one episode for each goal, and writes a film of them.
 
         Args:
-            out: A .gif or .mp4 file.
+            out: Path of a .gif or .mp4 file.
 
         Returns:
-            Number of goals that each policy achieved, and number of all goals.
+            For each policy, the number of goals that it achieved, and the number of all goals.
         """
         self.start()
         frames = [self.frame()]
@@ -155,7 +157,7 @@ class Viewer:
 
 
 def _check_comparable(policies: Sequence[Policy]) -> None:
-    """Refuses policies of different tasks: with the same seeds they would not have the same goals."""
+    """Refuses policies of different tasks, which would have different goals in spite of equal seeds."""
     first, *others = policies
     for other in others:
         first_task, other_task = _described(_task_of(first)), _described(_task_of(other))
@@ -171,7 +173,7 @@ def _task_of(policy: Policy) -> TaskConfig:
 
 
 def _described(task: TaskConfig) -> str:
-    """Describes a task and its options that differ from their defaults, in words."""
+    """Returns a task's name, followed by those of its options that differ from their defaults."""
     usual: dict[str, Any] = dict(get_task_spec(task.name).options)
     options = {**usual, **(task.options or {})}
     if task.threshold is not None:
@@ -181,10 +183,7 @@ def _described(task: TaskConfig) -> str:
 
 
 def _labels_of(policies: Sequence[Policy]) -> list[str]:
-    """Returns short names of policies: the last part of each path, or the whole path if parts are equal.
-
-    Policies with the same path have the same name.
-    """
+    """Returns a short name for each policy: the last part of its path, or the whole path if not unique."""
     sources = [policy.source for policy in policies]
     short = [Path(source).name or source for source in sources]
     return [name if short.count(name) == 1 else source for name, source in zip(short, sources, strict=True)]

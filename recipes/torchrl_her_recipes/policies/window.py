@@ -1,4 +1,4 @@
-"""Shows policies live in a window, or writes a video of them."""
+"""Shows policies live in a window that reacts to keys, or writes a video of them."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from torchrl_her_recipes.policies.policy import Policy
 from torchrl_her_recipes.policies.viewer import Seen, Viewer
 from torchrl_her_recipes.runs.film import FPS
 
-_RATES = (1, 2, 4, 8, FPS, 25, 50, 100, 200)  # steps a second
-_LOOKS = 30  # times a second that keys are read, at least
-_MOST_NUMBERS = 3  # goals with more coordinates are not written out
+_RATES = (1, 2, 4, 8, FPS, 25, 50, 100, 200)  # speeds that a user can choose, in steps per second
+_LOOKS = 30  # least number of times per second that keys are read
+_MOST_NUMBERS = 3  # largest number of coordinates with which a goal is written below the picture
 _KEYS = "space: pause    n: one step    r: next goals    + -: speed    q: quit"
 
 
@@ -34,20 +34,20 @@ def play(
 
     Args:
         sources: The policies, see :meth:`Policy.load`; all of the same task.
-        out: A .gif or .mp4 file; a window opens if None.
-        run: Index of the run of the first source, if that is a folder; the run with the median success if
-            None.
-        best: Whether to take the best policy of the first source, if that is a folder.
-        view: ``goals``, ``seed``, ``size`` and ``named`` of
+        out: Path of a .gif or .mp4 file; None opens a window.
+        run: Index of the run, if the first source is a folder with several runs side by side; by default, the
+            run with the median success.
+        best: Whether to load the best policy instead of the last one, if the first source is a folder.
+        view: Arguments ``goals``, ``seed``, ``size`` and ``named`` of
             ``torchrl_her_recipes.policies.viewer.Viewer``.
 
     Returns:
-        Number of goals that each policy achieved, and number of all goals that it had.
+        For each policy, the number of goals that it achieved, and the number of its goals.
 
     Raises:
-        ValueError: There is no such policy, the policies are of different tasks, nothing can be drawn, or
-            there is no display.
-        ImportError: A window needs the package pygame-ce.
+        ValueError: There is no such policy, the policies are of different tasks, their environments cannot
+            render pictures, or a window is requested without a display.
+        ImportError: A window is requested, but the package pygame-ce is not installed.
         OSError: A run has not saved a policy yet.
 
     Example:
@@ -70,8 +70,8 @@ def play(
 
 
 def show(viewing: Viewing, window: KeyWindow) -> None:
-    """Shows episodes in a window until it is closed."""
-    due = 0.0  # number of steps to take; grows each time that keys are read
+    """Shows episodes in a window and handles keys, until the user closes the window."""
+    due = 0.0  # steps that should have been taken by now, a fraction more each time that keys are read
     while not viewing.over:
         window.show(viewing.frame().numpy())
         rate, looks = viewing.rate, max(_LOOKS, viewing.rate)
@@ -85,10 +85,10 @@ def show(viewing: Viewing, window: KeyWindow) -> None:
 
 
 class Viewing:
-    """State of a viewing: episodes, their speed, and whether they are paused.
+    """State of a live view: episodes, their speed, and whether they are paused.
 
     Attributes:
-        paused: whether steps are taken only if the user presses a key for one.
+        paused: whether to wait with the next step until the user presses a key.
         over: whether the user has quit.
     """
 
@@ -100,11 +100,11 @@ class Viewing:
 
     @property
     def rate(self) -> int:
-        """Number of steps a second."""
+        """Current speed, in steps per second."""
         return _RATES[self._rate]
 
     def handle(self, command: Command) -> None:
-        """Carries out a user's request."""
+        """Carries out the command of a key: quit, pause, step, reset or a change of speed."""
         if command is Command.QUIT:
             self.over = True
         elif command is Command.PAUSE:
@@ -125,18 +125,18 @@ class Viewing:
             self._go_on(hold=self.rate)
 
     def frame(self) -> Tensor:
-        """Returns the present picture [height, width, 3] of uint8, with lines of information below it."""
+        """Returns the current picture, with status and keys written below it, [height, width, 3] of uint8."""
         return underlined(self._viewer.frame(), [self.status(), _KEYS])
 
     def status(self) -> str:
-        """Describes goals, step and speed in a line."""
+        """Describes the current goals, step and speed in one line."""
         viewer, goals, first = self._viewer, self._viewer.goals, self._viewer.first_goal
         which = f"goal {first}{self._where()}" if goals == 1 else f"goals {first} to {first + goals - 1}"
         speed = "paused" if self.paused else f"{self.rate} steps a second"
         return f"{which}, step {viewer.step_count} of {viewer.max_steps}, {speed}"
 
     def _where(self) -> str:
-        """Formats the coordinates of the goal, if there are few."""
+        """Formats the coordinates of the goal; returns an empty text if they are too many."""
         goal = self._viewer.desired_goal[0].flatten().tolist()
         return f" at ({', '.join(f'{x:.2f}' for x in goal)})" if len(goal) <= _MOST_NUMBERS else ""
 

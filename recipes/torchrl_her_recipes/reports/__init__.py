@@ -1,1 +1,1 @@
-"""Reports: pages and tables about the runs of a study."""
+"""Writes reports: pages and tables about the runs of a study, or about single runs."""

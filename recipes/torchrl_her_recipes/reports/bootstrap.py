@@ -1,7 +1,7 @@
-"""Interquartile means and their bootstrap intervals, by SciPy and `arch`.
+"""Computes interquartile means and their bootstrap intervals, with SciPy and `arch`.
 
-Agarwal et al., *Deep Reinforcement Learning at the Edge of the Statistical Precipice*, 2021, recommend them
-for few runs on several tasks.
+Agarwal et al., *Deep Reinforcement Learning at the Edge of the Statistical Precipice*, 2021, recommend these
+statistics for a few runs on each of several tasks.
 """
 
 from __future__ import annotations
@@ -14,23 +14,23 @@ import numpy as np
 try:
     from arch.bootstrap import IndependentSamplesBootstrap
     from scipy.stats import trim_mean
-except ImportError as error:  # not always installed: large, and only for reports
+except ImportError as error:  # these large packages are in an extra, since only reports need them
     raise ImportError("reports need the package arch: pip install '.[report]'") from error
 
 REPETITIONS = 2_000
-_SIZE = 0.95
-_CUT = 0.25  # fraction of the runs that is cut off at either end
+_SIZE = 0.95  # coverage of the intervals
+_CUT = 0.25  # fraction of the runs that is cut off at each end
 
 
 class Interval(NamedTuple):
-    """A number with its 95 % confidence interval, whose ends are NaN if there are too few samples."""
+    """A value with the ends of its 95 % confidence interval, which are NaN if there are too few samples."""
 
     value: float
     low: float
     high: float
 
     def overlaps(self, other: Interval) -> bool:
-        """Returns whether two intervals have a point in common.
+        """Returns whether this interval and another one have a point in common.
 
         Example:
             >>> Interval(0.2, 0.1, 0.3).overlaps(Interval(0.5, 0.3, 0.6))
@@ -47,7 +47,7 @@ def interquartile_means(groups: Sequence[Sequence[float] | np.ndarray]) -> np.nd
         [0.6, 1.5]
     """
     means = np.empty(len(groups))
-    for size in {len(group) for group in groups}:  # one call for each size: a bootstrap makes thousands
+    for size in {len(group) for group in groups}:  # groups of equal size at once, since a bootstrap is slow
         places = [place for place, group in enumerate(groups) if len(group) == size]
         means[places] = trim_mean(np.array([groups[place] for place in places]), _CUT, axis=1)
     return means
@@ -63,19 +63,19 @@ def bootstrap(
 ) -> tuple[list[Interval], list[Interval]]:
     """Computes interquartile means of groups of samples, and their differences, with 95 % intervals.
 
-    The bootstrap is stratified. Each repetition redraws every sample (runs of an algorithm on one task) from
-    its own runs, so that each task keeps its number of runs in a group (the algorithm on several tasks).
+    The bootstrap is stratified: each repetition redraws every sample (the runs of one algorithm on one task)
+    by itself, so that each task keeps its number of runs in a group (one algorithm on several tasks).
 
     Args:
-        samples: the runs of each algorithm on each task.
-        groups: indices of the samples in each mean.
-        pairs: pairs of groups, whose means are subtracted: the first minus the second.
+        samples: results of the runs in each sample.
+        groups: indices of the samples over which each mean is taken.
+        pairs: pairs of indices of groups; the mean of the second is subtracted from the mean of the first.
         repetitions: number of repetitions of the bootstrap.
-        seed: seed of its random numbers.
+        seed: seed of the bootstrap's random numbers.
 
     Returns:
-        One interval for each group, and one for each pair. If a sample has one run only, the ends of the
-        intervals that use it are NaN.
+        One interval for each group, and one for each pair. The ends of an interval are NaN if one of its
+        samples has a single run.
 
     Example:
         >>> means, differences = bootstrap([[0.5, 0.5], [0.25, 0.25]], [[0], [1]], [(0, 1)])

@@ -1,4 +1,4 @@
-"""Results of a study's combinations, their differences, and whether expected orders hold."""
+"""Computes results of a study's combinations and their differences, and judges the study's expectations."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _COUNTED = ("kl", "rows_")  # metrics that accumulate over a run, so that only t
 
 @dataclass(frozen=True)
 class Final:
-    """Result of one algorithm on one task, or on all tasks together: a row of the table."""
+    """Result of one algorithm on one task, or on all tasks together: a row of the table of results."""
 
     measure: str
     task: str
@@ -44,9 +44,9 @@ class Final:
 
 @dataclass(frozen=True)
 class Difference:
-    """Difference between the interquartile means of two algorithms: a row of the table.
+    """Difference between the interquartile means of two algorithms: a row of the table of differences.
 
-    ``apart``: whether the intervals of the two means have no point in common.
+    ``apart`` is true if the intervals of the two means have no point in common.
     """
 
     measure: str
@@ -66,9 +66,9 @@ class Difference:
 
 
 class Verdict(StrEnum):
-    """Outcome of an expected order."""
+    """Outcome of an expected order of two algorithms; see :func:`judge`."""
 
-    APART = "holds, apart"  # the intervals of the two algorithms have no common point
+    APART = "holds, apart"  # the intervals of the two algorithms have no point in common
     HOLDS = "holds, overlap"
     UNDECIDED = "undecided"
     REVERSED = "reversed"
@@ -77,7 +77,7 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True)
 class Judged:
-    """An expected order on one task: a row of the table."""
+    """An expected order of two algorithms on one task, with its verdict: a row of the table of orders."""
 
     measure: str
     task: str
@@ -90,7 +90,7 @@ class Judged:
 
 
 def values_of(cell: Combination, measure: str) -> list[float]:
-    """Returns the result of each run; runs without a number are left out."""
+    """Returns the value of a metric at the end of each run; runs whose value is NaN are left out."""
     if not cell.has(measure):
         return []
     last = 1 if measure.startswith(_COUNTED) else LAST
@@ -101,10 +101,10 @@ def values_of(cell: Combination, measure: str) -> list[float]:
 def compare(
     cells: Sequence[Combination], measure: str, published: Mapping[str, Any]
 ) -> tuple[list[Final], list[Difference]]:
-    """Returns the results of all combinations, and the differences of each two algorithms on the same task.
+    """Returns the results of all combinations in a metric, and differences of algorithms on the same task.
 
-    Differences are computed for finished runs only. Algorithms whose runs are finished on all tasks of the
-    study are compared on all tasks together, too.
+    Differences are computed only between algorithms whose runs are finished. Algorithms whose runs are
+    finished on all tasks of the study are also compared on all tasks together.
     """
     measured = [cell for cell in cells if values_of(cell, measure)]
     samples = [values_of(cell, measure) for cell in measured]
@@ -115,7 +115,7 @@ def compare(
         groups.append([index for index, cell in enumerate(measured) if cell.algorithm == algorithm])
     final = [all(measured[index].done for index in group) for group in groups]
     pairs = [
-        (first, second)  # the later algorithm minus the earlier: plain HER comes first in most studies
+        (first, second)  # the later algorithm minus the earlier one, which is plain HER in most studies
         for second, first in combinations(range(len(keys)), 2)
         if keys[first][0] == keys[second][0] and final[first] and final[second]
     ]
@@ -136,7 +136,7 @@ def compare(
 
 
 def _complete(cells: Sequence[Combination], measured: Sequence[Combination]) -> list[str]:
-    """Returns the algorithms whose runs are finished on all tasks, if there are several."""
+    """Returns the algorithms whose runs are finished on all tasks; none if the study has a single task."""
     tasks = {cell.task for cell in cells}
     counts = Counter(cell.algorithm for cell in measured if cell.done)
     return [name for name, count in counts.items() if count == len(tasks) > 1]
@@ -147,12 +147,12 @@ def judge(
 ) -> list[Judged]:
     """Judges whether expected orders hold, on each task of a study and, for success, on all tasks together.
 
-    An order holds if the 95 % interval of the difference lies on the expected side of 0. A stricter test is
-    reported, too: whether the intervals of the two algorithms have no point in common.
+    An order holds if the 95 % interval of the difference lies on the expected side of 0. A verdict also tells
+    whether the order passes a stricter test: that the intervals of both algorithms have no point in common.
 
     Args:
         cells: combinations of the study.
-        orders: the expected orders; orders of algorithms that the study does not have are left out.
+        orders: the expected orders; those that name an algorithm without results are left out.
         differences: differences from :func:`compare`.
     """
     tasks = list(dict.fromkeys(cell.task for cell in cells))
@@ -173,14 +173,14 @@ def _judge(
         if (gap.measure, gap.task) == (order.measure, task) and {gap.first, gap.second} == pair:
             verdict = _verdict(gap.minus_other(order.more), apart=gap.apart)
             why = "too few runs" if verdict is Verdict.OPEN else ""
-            written = gap.minus_other(order.text.split()[0])  # for a < b, the page shows a minus b
+            written = gap.minus_other(order.text.split()[0])  # as written: for a < b, a minus b
             return Judged(order.measure, task, order.text, verdict, *written, why)
     unknown = (math.nan, math.nan, math.nan)
     return Judged(order.measure, task, order.text, Verdict.OPEN, *unknown, _why(cells, order, task))
 
 
 def _verdict(rise: Interval, *, apart: bool) -> Verdict:
-    """Returns the verdict on an order, from the mean that is expected to be greater minus the other mean."""
+    """Returns the verdict on an order; ``rise`` is the mean expected to be greater minus the other mean."""
     if math.isnan(rise.low):
         return Verdict.OPEN
     if rise.low > 0:
@@ -189,7 +189,7 @@ def _verdict(rise: Interval, *, apart: bool) -> Verdict:
 
 
 def _why(cells: Sequence[Combination], order: Order, task: str) -> str:
-    """Returns the reason why an order cannot be judged yet."""
+    """Returns the reason why an order cannot be judged yet, such as unfinished runs."""
     lacking = [
         f"{cell.label} is {cell.state}"
         for cell in cells

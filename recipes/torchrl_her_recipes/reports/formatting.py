@@ -1,4 +1,4 @@
-"""Formats measures and numbers for readers of a report."""
+"""Formats names of metrics, numbers and intervals for the page of a report."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 
 from torchrl_her_recipes.reports.compare import Difference, Final, Judged, Verdict
 
-MEASURES = {  # metric to its name on the page
+MEASURES = {  # for each metric, its name on the page
     "success": "success",
     "reached": "goal reached at some step",
     "distance": "distance to goal",
@@ -17,7 +17,7 @@ MEASURES = {  # metric to its name on the page
     "rows_useful_virtual_positive": "positive rewards, virtual rows that count",
 }
 
-SIGNS = {  # verdict to its sign on the page, and the sign's CSS class
+SIGNS = {  # for each verdict, its sign on the page and the CSS class of the sign
     Verdict.APART: ("✓", "good"),
     Verdict.HOLDS: ("(✓)", "good"),
     Verdict.UNDECIDED: ("?", "fair"),
@@ -27,7 +27,7 @@ SIGNS = {  # verdict to its sign on the page, and the sign's CSS class
 
 
 def show(value: float | None, measure: str) -> str:
-    """Formats the value of a metric; a dash if there is no value.
+    """Formats the value of a metric; returns a dash if the value is None or NaN.
 
     Example:
         >>> show(0.614, "success"), show(1.0, "kl"), show(12345.6, "rows_real_positive"), show(None, "kl")
@@ -41,12 +41,12 @@ def show(value: float | None, measure: str) -> str:
 
 
 def show_interval(row: Final, measure: str) -> str:
-    """Formats an interquartile mean with its interval."""
+    """Formats an interquartile mean, followed by its interval in brackets."""
     return show(row.iqm, measure) + show_range(row.low, row.high, measure)
 
 
 def show_range(low: float, high: float, measure: str) -> str:
-    """Formats the ends of an interval in brackets; empty if the ends are not known.
+    """Formats the ends of an interval in brackets; returns an empty text if they are NaN.
 
     Example:
         >>> show_range(0.27, 0.45, "success")
@@ -58,7 +58,7 @@ def show_range(low: float, high: float, measure: str) -> str:
 
 
 def show_gap(row: Difference | Judged) -> str:
-    """Formats a difference with its interval; differences of success are in percentage points.
+    """Formats a difference and its interval with signs; differences of success are in percentage points.
 
     Example:
         >>> show_gap(Difference("success", "hand_v0", "her_ibs", "her", 0.0932, 0.01, 0.2, False))

@@ -1,4 +1,4 @@
-"""Writes a page about a study with its tables and pictures."""
+"""Writes a page about the results of a study, with its tables and pictures."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from torchrl_her_recipes.runs.plots import band
 from torchrl_her_recipes.runs.scores import LAST, last_success
 from torchrl_her_recipes.studies.plan import duration
 
-_AT_THE_END = ("success", "reached", "distance", "kl", "q_bias")  # metrics shown with intervals
+_AT_THE_END = ("success", "reached", "distance", "kl", "q_bias")  # metrics whose final values are compared
 _ABOUT = ("label", "task", "algorithm", "state", "runs", "epoch", "frames", "seconds", "differs")
 
 
@@ -34,26 +34,25 @@ def write_report(study: Study, folder: Path, out: Path) -> Path:
     """Writes a page about the results of a study so far, without training anything.
 
     Args:
-        study: study to report on.
+        study: study that the page is about.
         folder: folder with a folder for each combination, some of which may be missing or unfinished; or
             with the files that :func:`~torchrl_her_recipes.write_results` made from these folders.
-        out: folder for the page and its tables; pictures go into its `figures`.
+        out: folder for the page and its tables; pictures are written to its folder ``figures``.
 
     Returns:
-        The page.
+        The path of the page.
 
     Raises:
-        ValueError: the folder has none of the study's runs, or one cannot be read.
+        ValueError: the folder has none of the study's runs, or one of them cannot be read.
         OSError: the page cannot be written.
     """
     return write_page(read_study(study, folder), out)
 
 
 def write_page(results: Results, out: Path, *, back: str | None = None) -> Path:
-    """Writes a page about results that were read before.
+    """Writes a page about given results, and returns its path; ``back`` is a page that it links to.
 
-    Returns:
-        The page.
+    See :func:`write_report` for the folder ``out``.
     """
     page = _template().render(_describe(results, out), back=back, written=f"{datetime.now():%Y-%m-%d %H:%M}")
     path = out / "index.html"
@@ -62,7 +61,7 @@ def write_page(results: Results, out: Path, *, back: str | None = None) -> Path:
 
 
 def _describe(results: Results, out: Path) -> dict[str, Any]:
-    """Writes a page's tables and pictures, and returns its values by the names in the template."""
+    """Writes the tables and pictures of a page, and returns the variables of its template by name."""
     cells, orders = results.cells, read_orders(results.expect)
     measures = list(dict.fromkeys([*_AT_THE_END, *results.expect]))
     compared = [compare(cells, measure, results.published) for measure in measures]
@@ -109,12 +108,12 @@ def _duration(seconds: float) -> str:
 
 
 def _success_now(cell: Combination) -> str:
-    """Formats the median success of the runs in the last evaluation of a combination."""
+    """Formats the median success of a combination's runs in their last evaluation."""
     return show(statistics.median(last_success(cell.rows)), "success")
 
 
 def _averaged(cells: Sequence[Combination]) -> str:
-    """Describes the evaluations whose mean is shown: the last ones, or fewer if a run has fewer."""
+    """Describes over how many of the last evaluations results are averaged, which short runs limit."""
     counts = [min(LAST, len({row["epoch"] for row in cell.rows})) for cell in cells if not cell.missing]
     least, most = min(counts), max(counts)
     if most == 1:
@@ -123,7 +122,7 @@ def _averaged(cells: Sequence[Combination]) -> str:
 
 
 def _shares(rows: Sequence[Final]) -> dict[tuple[str, str], tuple[float, float | None]]:
-    """Computes each algorithm's divergence as a fraction of HER's on its task: measured and published."""
+    """Returns, by task and algorithm, the divergence as a fraction of HER's: measured and published."""
     her = {row.task: row for row in rows if row.algorithm == "her" and row.iqm > 0}
     shares = {}
     for row in rows:
@@ -135,7 +134,7 @@ def _shares(rows: Sequence[Final]) -> dict[tuple[str, str], tuple[float, float |
 
 
 def _by_order(judged: Sequence[Judged]) -> dict[tuple[str, str], dict[str, Judged]]:
-    """Arranges verdicts by measure and order, then by task."""
+    """Arranges judged orders as a table: by metric and order, and then by task."""
     table: dict[tuple[str, str], dict[str, Judged]] = {}
     for row in judged:
         table.setdefault((row.measure, row.order), {})[row.task] = row
@@ -168,7 +167,7 @@ def _cell(value: object) -> object:
 
 
 def _points(cell: Combination) -> list[dict[str, Any]]:
-    """Returns the rows of the page's table of curves."""
+    """Returns a combination's rows in the table of curves: percentiles of each metric by frames."""
     names = ("frames", "percentile_33", "median", "percentile_67")
     return [
         {"task": cell.task, "algorithm": cell.algorithm, "measure": measure}

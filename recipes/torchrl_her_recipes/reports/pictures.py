@@ -1,4 +1,4 @@
-"""Draws the pictures of a report, one panel in each file, with alternative texts."""
+"""Draws the pictures of a report, each panel in a file of its own, with texts for readers who cannot see."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from torchrl_her_recipes.reports.results import Combination
 from torchrl_her_recipes.runs.plots import Rows, band, colors, draw_curves, draw_goals
 
 _MIME = {".svg": "image/svg+xml", ".png": "image/png", ".gif": "image/gif", ".mp4": "video/mp4"}
-_WIDTH, _HEIGHT = 4.4, 3.9  # inches: the width of a phone, on which letters stay readable
+_WIDTH, _HEIGHT = 4.4, 3.9  # size in inches, narrow enough that letters are readable on a phone
 _INK = "#1a202c"
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture or film of the page.
+    """A picture or film on the page.
 
     Attributes:
-        file: file that is embedded.
-        alt: alternative text.
+        file: path of the file, which is embedded in the page.
+        alt: alternative text, which describes the picture.
     """
 
     file: Path
@@ -39,7 +39,7 @@ class Picture:
 
     @property
     def uri(self) -> str:
-        """The whole picture as a data URI."""
+        """The file's content as a data URI, so that the page needs no other files."""
         data = base64.b64encode(self.file.read_bytes()).decode()
         return f"data:{_MIME[self.file.suffix]};base64,{data}"
 
@@ -47,7 +47,7 @@ class Picture:
 def draw_pictures(
     cells: Sequence[Combination], finals: Sequence[Final], figures: Path
 ) -> dict[str, list[Picture]]:
-    """Draws all pictures: figures with a panel for each task, and a figure of heat maps for each task."""
+    """Draws the panels of all figures, by figure: metrics for each task, heat maps for each algorithm."""
     pictures: dict[str, list[Picture]] = {}
     palette = colors(list(dict.fromkeys(cell.algorithm for cell in cells)))
     for task in dict.fromkeys(cell.task for cell in cells):
@@ -71,7 +71,7 @@ def draw_pictures(
 def _curve(
     task: str, name: str, curves: Mapping[str, Rows], palette: Mapping[str, str], figures: Path
 ) -> Picture:
-    """Draws a metric of several algorithms; for Q of the first state, returns are added as dashed medians."""
+    """Draws a metric of several algorithms over environment steps; with Q, also draws returns (dashed)."""
     figure, axes = _panel(task)
     draw_curves(axes, curves, name, palette)
     handles, _ = axes.get_legend_handles_labels()
@@ -99,7 +99,7 @@ def _final(
     palette: Mapping[str, str],
     figures: Path,
 ) -> Picture:
-    """Draws success at the end: each run, the interquartile mean with its interval, the published number."""
+    """Draws success at the end of training: runs, interquartile means with intervals, published numbers."""
     figure, axes = _panel(task, height=1.5 + 0.42 * len(ends))
     for place, (label, (values, final)) in enumerate(ends.items()):
         color = palette[label]
@@ -121,9 +121,9 @@ def _final(
 
 
 def _goals(task: str, cells: Sequence[Combination], figures: Path) -> list[Picture]:
-    """Draws a heat map of each algorithm's virtual goals, and one of their target."""
+    """Draws heat maps of the virtual goals of each algorithm and of their target; none for other tasks."""
     if task not in TASKS:
-        return []  # goals of these tasks cannot be drawn on a screen
+        return []  # only goals of the throwing tasks lie on a screen
     maps = {cell.algorithm: cell.goals for cell in cells if cell.goals is not None}
     if not maps:
         return []
@@ -152,14 +152,14 @@ def _panel(title: str, *, height: float = _HEIGHT) -> tuple[Figure, Axes]:
 
 
 def _save(figure: Figure, stem: Path) -> Path:
-    """Writes a picture as .svg, and as .png for programs that cannot show .svg; returns the .svg file."""
+    """Writes a figure as .svg and, for programs that cannot show it, as .png; returns the .svg's path."""
     path = Path(f"{stem}.svg")
     figure.savefig(path, metadata={"Date": None})
-    figure.set_layout_engine("none")  # laid out before; doing so again takes longer than drawing
+    figure.set_layout_engine("none")  # keeps the layout: computing it again takes longer than drawing
     figure.savefig(f"{stem}.png", dpi=120)
     return path
 
 
 def _stem(figures: Path, *words: str) -> Path:
-    """Returns the name of a picture, in characters that every file system allows."""
+    """Returns the path of a picture without suffix, in characters that every file system allows."""
     return figures / re.sub(r"[^\w.=-]+", "_", "_".join(words))

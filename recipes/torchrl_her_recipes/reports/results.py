@@ -1,4 +1,4 @@
-"""Combinations of a study, their progress, and the results of their runs."""
+"""The class :class:`Combination`, the results of one combination of a study, and functions that read them."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from torchrl_her_recipes.studies.seed_batches import Batches
 
 @dataclass(frozen=True, kw_only=True)
 class Combination:
-    """Combination of a study, and the results of its runs so far.
+    """Results so far of the runs of one combination in a study.
 
-    It holds plain values, so that it can be read from folders of runs as well as from files of results.
+    All values are plain, so that they can be read from folders of runs or from files of results.
 
     Attributes:
         label: name of the combination and of its folder.
-        task: the task that was learned.
+        task: name of the task.
         algorithm: name that distinguishes the combination from others on the same task.
-        options: the options that the study varies, and their values in this combination.
+        options: the options that the study varies, with their values in this combination.
         rows: table of metrics, one row for each epoch and run.
-        done: whether the runs in its table have reached their last epoch.
-        epochs: the last epoch of its runs.
-        planned: number of its runs in the study.
-        seconds: duration of its runs on one core each; NaN if it is not known.
-        differs: options whose values differ from the study's, in words.
-        goals: histogram of its virtual goals; None if they were not counted.
+        done: whether the runs in the table have reached their last epoch.
+        epochs: number of epochs of a finished run.
+        planned: number of runs that the study plans for the combination.
+        seconds: total duration of the runs, each batch of runs on one core; NaN if it is unknown.
+        differs: options of the runs that differ from the study's, as text.
+        goals: histogram of virtual goals; None if they were not counted.
     """
 
     label: str
@@ -47,17 +47,17 @@ class Combination:
 
     @property
     def missing(self) -> bool:
-        """Whether there are no results."""
+        """Whether there are no results yet."""
         return not self.rows
 
     @property
     def epoch(self) -> int:
-        """Last epoch that was evaluated."""
+        """The last epoch that was evaluated; 0 if there was none."""
         return int(self.rows[-1]["epoch"]) if self.rows else 0
 
     @property
     def frames(self) -> int:
-        """Environment steps of each run so far."""
+        """Number of environment steps of each run so far."""
         return int(self.rows[-1]["frames"]) if self.rows else 0
 
     @property
@@ -76,16 +76,16 @@ class Combination:
 
     @property
     def whole(self) -> bool:
-        """Whether all of the study's runs are finished."""
+        """Whether all runs that the study plans for the combination are finished."""
         return self.done and self.runs >= self.planned
 
     def has(self, name: str) -> bool:
-        """Returns whether the table has a metric."""
+        """Returns whether all rows of the table have a metric."""
         return bool(self.rows) and all(name in row for row in self.rows)
 
 
 def read_combinations(study: Study, folder: Path) -> list[Combination]:
-    """Reads all combinations of a study, with their results in a folder."""
+    """Reads the results of all combinations of a study from the folder in which it was run."""
     if not folder.is_dir():
         raise ValueError(f"there is no folder {folder}; `torchrl-her study {study.name}` makes its runs")
     cells = []
@@ -102,7 +102,7 @@ def read_combinations(study: Study, folder: Path) -> list[Combination]:
 
 
 def read_single(label: str, batches: Batches) -> Combination:
-    """Reads a single run as a combination, described by its options that differ from the defaults."""
+    """Reads runs outside of a study, which differ only in seeds, as a combination that is named ``label``."""
     recipes = [home.recipe() for home in batches.homes]
     planned = recipes[0].replace(num_runs=sum(recipe.run.num_runs for recipe in recipes))
     differs = [f"{name}={value}" for name, value, _ in _differences(planned, Recipe())]
@@ -135,7 +135,7 @@ def _combination(
 
 
 def _differences(used: Recipe, usual: Recipe) -> list[tuple[str, Any, Any]]:
-    """Returns the options in which two recipes differ, and their values in both."""
+    """Returns the options in which two recipes differ: (name, value in ``used``, value in ``usual``)."""
     left, right = dict(_flat(used.to_dict())), dict(_flat(usual.to_dict()))
     changed = {*dict(_flat(used.changed())), *dict(_flat(usual.changed()))}
     differ = [name for name, value in left.items() if name in changed and value != right.get(name)]
@@ -143,7 +143,7 @@ def _differences(used: Recipe, usual: Recipe) -> list[tuple[str, Any, Any]]:
 
 
 def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Flattens nested mappings to one with names such as ``group.option``."""
+    """Yields the values in nested mappings, with names such as ``group.option``."""
     for name, value in values.items():
         if isinstance(value, Mapping) and value:
             yield from _flat(value, f"{prefix}{name}.")

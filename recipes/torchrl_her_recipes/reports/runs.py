@@ -1,4 +1,4 @@
-"""Writes a page about single runs or a folder of runs, finished or not."""
+"""Writes a page about single runs or about a folder of runs, finished or not."""
 
 from __future__ import annotations
 
@@ -15,14 +15,15 @@ from torchrl_her_recipes.reports.tidy import Results
 from torchrl_her_recipes.studies.seed_batches import Batches
 
 _FILMS = (".gif", ".mp4")
-_LARGEST = 20_000_000  # bytes of a film
+_LARGEST = 20_000_000  # largest size in bytes of a film that is embedded in the page
 
 
 def read_runs(folders: Sequence[Path]) -> Results:
-    """Reads some runs; those that differ only in their seeds form one algorithm on the page.
+    """Reads runs for a page; runs that differ only in their seeds form one algorithm.
 
     Args:
-        folders: folders of runs, or of batches of seeds (``seeds_*``), or with such folders in them.
+        folders: folders of runs, folders with batches of seeds (``seeds_*``), or folders that contain such
+            folders.
     """
     paths = [path for folder in folders for path in _runs_in(folder)]
     groups = _by_recipe(paths)
@@ -42,21 +43,21 @@ def write_runs_report(folders: Sequence[Path], out: Path) -> Path:
     """Writes a page about single runs, finished or not, without training anything.
 
     Args:
-        folders: folders of runs, or of folders with runs in them.
-        out: folder for the page and its tables; pictures go into its `figures`.
+        folders: folders of runs, or folders that contain folders of runs.
+        out: folder for the page and its tables; pictures are written to its folder ``figures``.
 
     Returns:
-        The page.
+        The path of the page.
 
     Raises:
-        ValueError: a folder has no run, or one cannot be read.
+        ValueError: a folder has no run, or a run cannot be read.
         OSError: the page cannot be written.
     """
     return write_page(read_runs(folders), out)
 
 
 def _newest_film(folders: Sequence[Path]) -> Picture | None:
-    """Returns the newest video in the folders of runs; None if no video is small enough for the page."""
+    """Returns the newest video in folders of runs that is small enough for the page, or None."""
     homes = [home.path for folder in folders for home in Batches(folder).homes]
     films = [path for home in homes for path in home.glob("*.*") if path.suffix in _FILMS]
     whole = [path for path in films if not path.stem.endswith(".part") and path.stat().st_size <= _LARGEST]
@@ -68,7 +69,7 @@ def _newest_film(folders: Sequence[Path]) -> Picture | None:
 
 
 def _runs_in(folder: Path) -> list[Path]:
-    """Finds the folders of runs in a folder."""
+    """Returns a folder itself if it is the folder of a run, or else the folders of runs in it."""
     if Batches(folder).homes:
         return [folder]
     paths = [path for path in sorted(folder.iterdir()) if path.is_dir() and Batches(path).homes]
@@ -78,7 +79,7 @@ def _runs_in(folder: Path) -> list[Path]:
 
 
 def _by_recipe(paths: Sequence[Path]) -> list[list[Path]]:
-    """Groups folders by recipe: runs of a group have equal options except for seeds, which differ."""
+    """Groups folders of runs; the runs of a group have the same options, but different seeds."""
     groups: list[tuple[Recipe, set[int], list[Path]]] = []
     for path in paths:
         recipes = [home.recipe() for home in Batches(path).homes]
@@ -97,7 +98,7 @@ def _by_recipe(paths: Sequence[Path]) -> list[list[Path]]:
 
 
 def _labels(groups: Sequence[Sequence[Path]]) -> list[str]:
-    """Returns names for groups: the last part of the first path, without seeds, or else the whole path."""
+    """Names groups by their first folders (without the seed, if there are several) or, if equal, by paths."""
     names = [
         re.sub(r"_s\d+(_\d+)?$", "", group[0].resolve().name) if len(group) > 1 else group[0].resolve().name
         for group in groups

@@ -1,4 +1,4 @@
-"""Stores the numbers of a study in a few files: one table of all its runs, and facts about them."""
+"""Writes the results of a study to a few small files, from which they can be read without its runs."""
 
 from __future__ import annotations
 
@@ -39,15 +39,15 @@ _KEPT = ("task", "algorithm", "options", "done", "epochs", "planned", "seconds",
 
 @dataclass(frozen=True, kw_only=True)
 class Results:
-    """Results of a study.
+    """Results of a study, or of single runs.
 
     Attributes:
-        name: name of the study.
+        name: name of the study, or names of the folders of runs.
         summary: one-line description for users.
-        cells: its combinations.
+        cells: results of each combination.
         kind: origin of the results: a ``"study"`` or single ``"runs"``.
-        expect, published: as in :class:`~torchrl_her_recipes.Study`.
-        film: the newest film of its policies, if there is one.
+        expect, published: expected and published results, see :class:`~torchrl_her_recipes.Study`.
+        film: the newest film of a policy, or None.
     """
 
     name: str
@@ -60,16 +60,16 @@ class Results:
 
 
 def is_results(folder: Path) -> bool:
-    """Returns whether a folder holds the files of :func:`write_results`, and not the folders of runs."""
+    """Returns whether a folder has the files of :func:`write_results` instead of folders of runs."""
     return (folder / _ABOUT).is_file()
 
 
 def read_study(study: Study, folder: Path) -> Results:
-    """Reads the results of a study, from the folders of its runs or from the files made of them.
+    """Reads the results of a study, from folders of runs or from files of :func:`write_results`.
 
     Args:
         study: study whose results are read.
-        folder: folder with a folder for each combination, or with the files of :func:`write_results`.
+        folder: folder with a folder for each combination, or with the files.
     """
     if not is_results(folder):
         facts = {name: getattr(study, name) for name in ("name", "summary", "expect", "published")}
@@ -83,16 +83,16 @@ def read_study(study: Study, folder: Path) -> Results:
 def write_results(
     study: Study, folder: Path, out: Path, *, command: str | Sequence[str] | None = None
 ) -> Path:
-    """Writes the numbers of a study's runs as few small files, from which reports can be made again.
+    """Writes the results of a study to a few small files, from which its report can be made without the runs.
 
     - ``runs.csv`` has a row for each run and evaluation: the combination (``label``, ``task``, ``algorithm``
       and the other options that the study varies), ``seed``, ``epoch``, ``frames`` and all metrics, with six
-      significant digits. If the combination does not have a metric, its place is empty. A table of more
-      than one megabyte is compressed: ``runs.csv.gz``.
+      significant digits. Metrics that a combination lacks are empty. If the table is larger than one
+      megabyte, it is compressed to ``runs.csv.gz``.
     - ``goals.npz`` has the histograms of virtual goals, ``LABEL.counts`` and ``LABEL.target`` for each
-      combination, if there are any.
-    - ``about.yaml`` has the command, the versions, the date, the study's recipe, and the state of each
-      combination.
+      combination. It is missing if virtual goals were not counted.
+    - ``about.yaml`` has the command, the versions of packages, the date, the study's recipe, and the state of
+      each combination.
 
     Args:
         study: study whose results are written.
@@ -104,7 +104,7 @@ def write_results(
         The folder of the files.
 
     Raises:
-        ValueError: the folder has none of the study's runs, or one cannot be read.
+        ValueError: the folder has none of the study's runs, or one of them cannot be read.
         OSError: the files cannot be written.
     """
     cells = read_combinations(study, folder)
@@ -122,12 +122,12 @@ def write_results(
 
 
 def write_files(about: Mapping[str, Any], cells: Sequence[Combination], out: Path) -> Path:
-    """Writes the results of combinations that were read before."""
+    """Writes the files of :func:`write_results` for given facts about a study and given combinations."""
     out.mkdir(parents=True, exist_ok=True)
     _write_table(cells, out)
     _write_goals(cells, out / _GOALS)
     states = {cell.label: {name: getattr(cell, name) for name in _KEPT} for cell in cells}
-    # Converted through JSON, since YAML writes neither numpy's numbers nor subclasses of dict.
+    # Converted through JSON, since PyYAML's safe_dump refuses numpy's numbers and subclasses of dict.
     plain = json.loads(json.dumps({**about, "combinations": states}, default=np.generic.item))
     text = yaml.safe_dump(plain, sort_keys=False, allow_unicode=True, width=110)
     # Written last: a folder with this file counts as results.
@@ -136,7 +136,7 @@ def write_files(about: Mapping[str, Any], cells: Sequence[Combination], out: Pat
 
 
 def read_results(folder: Path) -> Results:
-    """Reads the files of :func:`write_results`."""
+    """Reads the results of a study from the files that :func:`write_results` wrote to a folder."""
     path = folder / _ABOUT
     if not path.is_file():
         raise ValueError(f"{folder} holds no results: it has no {_ABOUT}")
@@ -183,14 +183,14 @@ def _write_table(cells: Sequence[Combination], out: Path) -> None:
 
 
 def _number(value: float | None) -> str:
-    """Formats a number with six significant digits; whole numbers with all of them."""
+    """Formats a number with six significant digits, or a whole number with all its digits."""
     if value is None:
         return ""
     return str(int(value)) if float(value).is_integer() else f"{value:.6g}"
 
 
 def _read_table(folder: Path) -> dict[str, list[dict[str, float]]]:
-    """Reads the table of runs: rows by label, in the order of epochs and runs."""
+    """Reads the table of runs; returns the rows of each combination by its label, by epoch and run."""
     path, packed = folder / _RUNS, folder / f"{_RUNS}.gz"
     if not path.is_file() and not packed.is_file():
         raise ValueError(f"{folder} has no {_RUNS}")
@@ -204,7 +204,7 @@ def _read_table(folder: Path) -> dict[str, list[dict[str, float]]]:
         names = lines.fieldnames or []
         if not {"label", *_KEYS} <= set(names):
             raise ValueError(f"its columns are {', '.join(names)}")
-        numbers = names.index("seed")  # the columns before these identify the combination
+        numbers = names.index("seed")  # earlier columns identify the combination
         for line in lines:
             row = {name: number(line[name]) for name in names[numbers:] if line[name] != ""}
             tables.setdefault(line["label"], []).append(row)
@@ -214,7 +214,7 @@ def _read_table(folder: Path) -> dict[str, list[dict[str, float]]]:
 
 
 def _count(rows: list[dict[str, float]]) -> list[dict[str, float]]:
-    """Numbers runs in the order of their seeds, as when the folders of runs are read."""
+    """Adds the index of the run to each row; runs are numbered by their seeds, as in folders of runs."""
     places = {seed: run for run, seed in enumerate(sorted({row["seed"] for row in rows}))}
     return sorted(
         ({"run": places[row["seed"]], **row} for row in rows), key=lambda row: (row["epoch"], row["run"])
@@ -245,7 +245,7 @@ def _read_goals(path: Path) -> dict[str, GoalMap]:
 
 
 def _origin(homes: Sequence[RunFolder]) -> dict[str, Any]:
-    """Returns the day of the last evaluation, and the versions of packages in all runs."""
+    """Returns the date of the last evaluation, and the versions of packages with which runs were trained."""
     versions: dict[str, set[str]] = {}
     for path in (home.about for home in homes if home.about.is_file()):
         with naming(path):

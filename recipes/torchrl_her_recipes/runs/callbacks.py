@@ -1,4 +1,4 @@
-"""Callbacks: user code that a run calls during training, and that may stop it."""
+"""Callbacks: user code that is called during training and can stop a run."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from torchrl_her_recipes.runs.folder import RunFolder
 
 @dataclass(frozen=True)
 class RunView:
-    """Live view of a run for callbacks.
+    """The state of a run in progress, which is passed to callbacks.
 
     Attributes:
         components: components of the run.
@@ -30,15 +30,17 @@ class RunView:
 
 
 class Callback:
-    """Base class of callbacks. Override the methods that you need; here they do nothing.
+    """Base class of callbacks. Override the methods that you need; those of this class do nothing.
 
-    ``on_batch`` and ``on_epoch`` may return True to stop the run in good order: its checkpoint, pictures and
-    policy are written as at its end, and :func:`~torchrl_her_recipes.resume` can continue it. All callbacks
-    are called, in their order, even if an earlier one returns True. An error that a callback raises ends the
-    run at once, and ``on_end`` is then not called.
+    ``on_batch`` and ``on_epoch`` can return True to stop the run. The run then writes its checkpoint,
+    pictures and policy as at its end, and :func:`~torchrl_her_recipes.resume` can continue it. All callbacks
+    are
+        called
+    in order, even if an earlier one returns True. If a callback raises an error, the run ends at once, and
+    ``on_end`` is not called.
 
-    Checkpoints do not contain callbacks. If a callback decides from ``rows`` alone, resuming the run does not
-    change its decisions.
+    Checkpoints do not contain callbacks. A callback that decides from ``rows`` alone decides the same when
+    the run is resumed.
 
     Example:
         >>> class FrameLimit(Callback):
@@ -47,7 +49,7 @@ class Callback:
     """
 
     def on_start(self, run: RunView) -> None:
-        """Called before the first batch, also when a run resumes."""
+        """Called before the first batch, also when a run is resumed."""
 
     def on_batch(self, run: RunView) -> bool | None:
         """Called after each collected batch and its gradient steps; returns whether to stop."""
@@ -56,31 +58,31 @@ class Callback:
     def on_epoch(self, run: RunView) -> bool | None:
         """Called after each evaluation; returns whether to stop.
 
-        The new rows are at the end of ``rows``. What this method changes, as numbers in these rows, goes into
-        the table and the checkpoint of this epoch.
+        The new rows are at the end of ``rows``. The table and the checkpoint of the epoch are written after
+        this call, so changes that it makes, for instance to these rows, are saved.
         """
         return None
 
     def on_end(self, run: RunView) -> None:
-        """Called after everything was written, also after Ctrl-C or a stop."""
+        """Called after all files were written, also if Ctrl-C or a callback stopped the run."""
 
 
 class EarlyStopping(Callback):
-    """Stops a run when the median of a metric was good enough in some evaluations in a row.
+    """Stops a run when a metric was within a bound in a given number of evaluations in a row.
 
-    The median is over the runs that are trained side by side.
+    If several runs are trained side by side, their median counts.
 
     Args:
         metric: a column of the table of metrics.
 
     Keyword Args:
-        at_least: the smallest value that is good enough.
-        at_most: the largest value that is good enough, for metrics such as ``distance``. Give either bound.
-        epochs: number of evaluations in a row that must be good enough.
+        at_least: lower bound of the metric.
+        at_most: upper bound, for metrics such as ``distance``. Give exactly one of the bounds.
+        epochs: number of evaluations in a row in which the metric must be within the bound.
 
     Raises:
-        ValueError: both bounds or none are given, ``epochs`` is below 1; when running, the table has no such
-            column.
+        ValueError: both bounds or none are given, or ``epochs`` is below 1; during a run, the table has no
+            such column.
 
     Example:
         >>> stopping = EarlyStopping("success", at_least=0.9, epochs=2)
@@ -104,11 +106,11 @@ class EarlyStopping(Callback):
         self.metric, self.at_least, self.at_most, self.epochs = metric, at_least, at_most, epochs
 
     def on_epoch(self, run: RunView) -> bool:
-        """Returns whether the metric has been good enough in the required number of evaluations."""
+        """Returns whether to stop the run; see :meth:`reached`."""
         return self.reached(run.rows)
 
     def reached(self, rows: Sequence[dict[str, float]]) -> bool:
-        """Returns whether the last evaluations of a table are all good enough; NaN never is good enough.
+        """Returns whether the metric was within its bound in the last ``epochs`` evaluations; NaN never is.
 
         Args:
             rows: the table, with a row for each epoch and run.
@@ -118,7 +120,7 @@ class EarlyStopping(Callback):
         """
         last = sorted({row["epoch"] for row in rows})[-self.epochs :]
         if rows and not any(self.metric in row for row in rows) and rows[-1].get("updates", 1) > 0:
-            # Only after the first update, since columns of losses are missing before.
+            # Only after the first gradient step, since columns of losses are missing before.
             raise ValueError(f"metric must be one of {', '.join(rows[-1])}, got {self.metric!r}")
         return len(last) == self.epochs and all(
             self._is_good([row.get(self.metric, math.nan) for row in rows if row["epoch"] == epoch])

@@ -1,4 +1,4 @@
-"""Advice on options from random actions on a task."""
+"""Derives advice on options from facts that random actions show about a task."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from torchrl_her_recipes.components.first_look import Facts, resolved
 from torchrl_her_recipes.config.algorithms import Algorithm
 from torchrl_her_recipes.config.recipe import Recipe
 
-_SELDOM = 0.5  # fraction of the episodes below which something happens seldom
+_SELDOM = 0.5  # fraction of the episodes; the achieved goal changes seldom if it changes in fewer
 _UNLIKE = 100  # ratio of scales above which observations need normalization
-_SLOW = 5e-3  # seconds of a step in a slow environment: about the time of a gradient step
-_MOSTLY = 0.5
-_ROUNDED = 0.005
+_SLOW = 5e-3  # seconds; an environment is slow if a step takes longer, which a gradient step hardly does
+_MOSTLY = 0.5  # fraction of achieved goals above which success says little about learning
+_ROUNDED = 0.005  # fraction below which a percentage would be rounded to 0%
 
 _STILL = (
     "random actions change the achieved goal, by the reward, in {moved} of the episodes: most virtual goals "
@@ -21,24 +21,24 @@ _STILL = (
 
 
 def advice(facts: Facts, recipe: Recipe, stages_file: str = "stages.yaml") -> list[str]:
-    """Returns a line for each problem that the facts show, with the options to set.
+    """Returns a line for each problem that the facts show, with the options that help.
 
     Args:
-        facts: Facts of :func:`look_at`.
+        facts: Facts that :func:`look_at` returned.
         recipe: Recipe of the planned run.
-        stages_file: File of the proposed stages.
+        stages_file: Name of the file in which proposed stages are saved, for the text of the advice.
     """
     recipe, lines = resolved(recipe), []
     if facts.disagree:
         lines.append(
-            f"{_percent(facts.disagree)} of the steps have another reward than compute_reward gives, and "
-            "virtual transitions lack the difference: if compute_reward reads info, name its keys "
+            f"in {_percent(facts.disagree)} of the steps, the reward differs from compute_reward, which "
+            "virtual transitions use: if compute_reward reads info, name its keys "
             "(task.options.info_keys=[KEY])"
         )
     if facts.goal_inside:
         lines.append(
             f"entries {facts.goal_inside[0]} to {facts.goal_inside[-1]} of the observation are the desired "
-            "goal, which relabeling cannot change there: leave them out of the observation"
+            "goal, but relabeling does not change the observation: leave them out"
         )
     if facts.moved < _SELDOM:
         remedy = _remedy(facts, recipe.hindsight.algorithm, recipe.curriculum.stages, stages_file)
@@ -47,19 +47,19 @@ def advice(facts: Facts, recipe: Recipe, stages_file: str = "stages.yaml") -> li
         lines.append("by the reward, achieved_goal never changed: does it hold what the goal is about?")
     if facts.fallen and recipe.task.failure == "environment":
         lines.append(
-            f"{facts.fallen:.1%} of the episodes terminate without the goal: if each step costs a reward of "
-            "-1, ending soon is the best. With failure=never_pays it is not"
+            f"{facts.fallen:.1%} of the episodes terminate without the goal: with a reward of -1 for each "
+            "step, a policy learns to fail early. failure=never_pays prevents this"
         )
     if not recipe.learner.normalize and facts.scales[1] > _UNLIKE * facts.scales[0]:
         lines.append("entries of the observation are of very different scales: normalize=true")
     if facts.seconds > _SLOW and recipe.collection.processes == 0:
         lines.append(
-            f"a step takes {1e3 * facts.seconds:.0f} ms, more than learning from it: processes=2 lets two "
-            "processes collect beside the learner"
+            f"an environment step takes {1e3 * facts.seconds:.0f} ms, longer than a gradient step: with "
+            "processes=2, two processes collect while the main process learns"
         )
     if facts.achieved > _MOSTLY:
         lines.append(
-            f"random actions achieve {facts.achieved:.0%} of the goals: such a success rate shows no learning"
+            f"random actions achieve {facts.achieved:.0%} of the goals: only more success shows learning"
         )
     return lines
 

@@ -1,4 +1,4 @@
-"""Runs in a curriculum: measures their success in their stage, and moves them to the next one."""
+"""Measures the success of runs in their stages of a curriculum, and moves runs to the next stage."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from torchrl_her_recipes.components.envs import judging, play_episodes
 
 
 def play_greedily(components: Components, env: EnvBase, epoch: int) -> TensorDictBase:
-    """Plays greedy episodes, run after run, with new starts and goals in each epoch."""
+    """Plays greedy episodes of all runs, with starts and goals that are new in each epoch."""
     recipe = components.recipe
     goal_env(env).set_seeds(eval_seeds(recipe.seeds, epoch))
     return play_episodes(env, components.player, recipe.evaluation.episodes, runs=recipe.run.num_runs)
@@ -27,7 +27,7 @@ def play_greedily(components: Components, env: EnvBase, epoch: int) -> TensorDic
 def stage_success(
     components: Components, state: CurriculumState, rollout: TensorDictBase, epoch: int
 ) -> Tensor:
-    """Returns success [R, n] at the goals of the runs' stages; in the last stage, of ``rollout``."""
+    """Returns success [R, n] at goals of each run's stage; ``rollout`` has episodes of the full task."""
     runs, last = components.recipe.run.num_runs, len(state.curriculum) - 1
     full = success(rollout, **judging(components.eval_env)).float().view(runs, -1)
     below = state.progress.stage < last
@@ -39,15 +39,15 @@ def stage_success(
 
 
 def move_on(components: Components, state: CurriculumState, samples: Tensor, frames: int) -> list[str]:
-    """Moves runs that have learned their stage to the next one, and returns a message for each of them."""
+    """Moves runs on whose success ``samples`` [R, n] end their stage; returns a message for each of them."""
     before, evaluations = state.progress.stages, state.progress.evaluations
-    # At most a window's number: with more samples in an evaluation, a lucky streak becomes more likely.
+    # At most ``window`` samples, since more samples of one evaluation would make a lucky streak more likely.
     moved = state.progress.record(samples[:, : state.progress.window])
     learner, exploration, lines = components.recipe.learner, components.exploration, []
     for run in moved.nonzero().flatten().tolist():
         old, new = state.curriculum.stages[before[run]], state.progress.stage_of(run)
         seed = components.recipe.seeds[run]
-        learned = "learned" if evaluations[run] + 1 != state.progress.patience else "not learned, but left"
+        learned = "learned" if evaluations[run] + 1 != state.progress.patience else "ended without success"
         lines.append(f"seed {seed}: {old.name!r} {learned} after {frames:,} frames, {new.name!r} begins")
         if components.guide is not None:
             components.guide.follow(components.greedy, before[run], run=run)

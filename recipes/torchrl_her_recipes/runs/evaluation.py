@@ -1,4 +1,4 @@
-"""Measurements of runs at the end of an epoch."""
+"""Computes the metrics of runs at the end of an epoch."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from torchrl_her_recipes.runs.notices import saturation
 
 @torch.no_grad()
 def measure(components: Components, rollout: TensorDictBase) -> dict[str, Tensor]:
-    """Computes metrics of policy and critics from greedy episodes of each run, [R] each.
+    """Computes metrics of policy and critics from greedy episodes; each metric has a value per run, [R].
 
-    ``q`` is the value of the first action by the loss's own critics (see
-    :func:`~torchrl_her.objectives.critic_value`). ``q_bias`` is ``q`` minus the return of the evaluated
-    policy: the average of the actor, if there is one. Both are missing if the loss has no such critics.
+    ``q`` is the value that the critics in the loss give to the first action, see
+    :func:`~torchrl_her.objectives.critic_value`. ``q_bias`` is ``q`` minus the discounted return of the
+    episode. Both are missing if the loss has no critics with a value of one number.
     """
     recipe, judged_by = components.recipe, judging(components.eval_env)
     succeeded = success(rollout, **judged_by)
-    # Return after truncation: an episode that is truncated at its goal is assumed to stay there.
+    # After truncation, an episode is assumed to stay at its goal if it is there, and else never to reach it.
     missed, achieved = components.rewards
     tail = torch.where(succeeded, achieved, missed).to(rollout["next", "reward"].dtype)
     returns = discounted_return(rollout, recipe.learner.gamma, tail_reward=tail)
@@ -51,7 +51,7 @@ def measure(components: Components, rollout: TensorDictBase) -> dict[str, Tensor
 
 
 def written(components: Components, run: int) -> dict[str, float]:
-    """Returns the counts of one run's writer, as metrics."""
+    """Returns metrics of the rows that one run has written: counts, and the divergence ``kl`` of goals."""
     writer = components.buffer.writer
     counts = {f"rows_{name}": value for name, value in asdict(writer.totals_of(run)).items()}
     weights = writer.goal_weights[run] if writer.goal_weights else None
@@ -61,7 +61,7 @@ def written(components: Components, run: int) -> dict[str, float]:
     elif isinstance(weights, InstructiveWeights):
         divergence = weights.divergence
     if divergence is not None:
-        # q* is of the full task's goals, so that lower stages have no divergence from it
+        # q* describes goals of the full task, with which goals of earlier stages cannot be compared.
         full = components.curriculum is None or components.curriculum.at_the_top(run)
         counts["kl"] = divergence if full else math.nan
     return counts

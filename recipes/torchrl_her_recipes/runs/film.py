@@ -17,17 +17,17 @@ from torchrl_her_envs.registry import get_task_spec
 from torchrl_her_recipes.components.curricula import make_played_env
 from torchrl_her_recipes.components.envs import TaskEnvs
 
-FPS = 12  # half the true speed of the throwing tasks, as a throw takes half a second
-_FILMED = 6  # environments in the video
+FPS = 12  # frames per second: half the true speed of the throwing tasks, whose throws take half a second
+_FILMED = 6  # largest number of environments in the video
 
 
 def film_policy(
     envs: TaskEnvs, env: EnvBase, player: TensorDictModuleBase, out: Path, *, seeds: Sequence[int], run: int
 ) -> None:
-    """Makes a video of greedy episodes of one of the runs, if its environment can be rendered.
+    """Makes a video of greedy episodes of one run, if its environment can be rendered.
 
-    Some environments render only if they are made for it; such environments are made anew. If rendering
-    fails, as on a machine without a display, there is a warning and no video.
+    Environments that render only if they were made with certain options are made again with these. If
+    rendering fails, for instance without a display, there is a warning and no video.
     """
     count = env.numel() // len(seeds)
     filmed = min(_FILMED, count)
@@ -38,7 +38,7 @@ def film_policy(
             with closing(make_played_env(envs, filmed, seeds, pictures=True)) as drawn:
                 if goal_env(drawn).can_render:
                     _film(player, drawn, out, run * filmed, filmed)
-        except Exception as error:  # a renderer may raise any error, which must not end a run that is done
+        except Exception as error:  # renderers raise errors of any type; a finished run must not fail by them
             reason = " ".join(f"{type(error).__name__}: {error}".split())
             warnings.warn(f"no {out.name}: the environment could not be drawn: {reason}", stacklevel=2)
 

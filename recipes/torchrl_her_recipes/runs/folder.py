@@ -1,4 +1,4 @@
-"""The folder of a run: configuration, metrics, checkpoint, pictures."""
+"""The class :class:`RunFolder`: paths of a run's files, its recipe and its table of metrics."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ _PACKAGES = ("torchrl-her", "torch", "torchrl", "tensordict", "gymnasium", "pymu
 
 
 class RunFolder:
-    """Paths and the metrics table of one run.
+    """The folder of a run: paths of its files, and functions that read and write its recipe and metrics.
 
     Args:
-        path: path of the folder; :meth:`create` makes it.
+        path: path of the folder; it need not exist before :meth:`create`.
 
     Example:
         >>> print(RunFolder("runs/mine"))
@@ -58,10 +58,10 @@ class RunFolder:
 
     @classmethod
     def of(cls, source: str | Path) -> RunFolder | None:
-        """Returns the run folder at a path, or around a policy's file at this path; None for other paths.
+        """Returns the run folder at a path, or the run folder of the policy's file at this path; else None.
 
         Args:
-            source: the folder, or the file of one of its policies.
+            source: path of a folder, or of a policy's file in a run folder.
 
         Example:
             >>> RunFolder.of("runs/nowhere")
@@ -73,15 +73,16 @@ class RunFolder:
 
     @contextmanager
     def at_work(self, *, wait: float = 0.0) -> Iterator[None]:
-        """Keeps other processes from training into the folder, and removes unfinished files of a killed run.
+        """Locks the folder, so that no other process trains in it, and removes partial files of a killed run.
 
-        The folder is free again when the process ends, even if it is killed. One process may nest calls.
+        The lock is released at the end of the block, or when the process ends, even if it is killed. A
+        process can take the lock several times.
 
         Args:
-            wait: seconds to wait for another process to end; one that lost its parent first saves its run.
+            wait: seconds to wait for the lock: a worker whose parent was killed needs time to save its run.
 
         Raises:
-            ValueError: another process is at work in the folder.
+            ValueError: another process has the lock.
         """
         lock = FileLock(self.path / ".lock", is_singleton=True)
         try:
@@ -109,7 +110,7 @@ class RunFolder:
         self.path.mkdir(parents=True, exist_ok=True)
 
     def describe(self, recipe: Recipe) -> None:
-        """Writes the recipe, and the versions of the packages that train it."""
+        """Writes the recipe to ``config.yaml``, and the seed and versions of packages to ``run.json``."""
         about = {
             "seed": recipe.run.seed,
             "python": platform.python_version(),
@@ -121,16 +122,16 @@ class RunFolder:
         remember(self.config, recipe.task.name)
 
     def describe_best(self, epoch: int, success: float) -> None:
-        """Adds the evaluation of the best policy to the file that :meth:`describe` wrote."""
+        """Adds epoch and success of the best policy to ``run.json``, which :meth:`describe` wrote."""
         about = read_json(self.about) | {"best": {"epoch": epoch, "success": success}}
         write_text(self.about, json.dumps(about, indent=2) + "\n")
 
     def recipe(self) -> Recipe:
-        """Reads the recipe. If this user has trained the run, the module that its task names is permitted.
+        """Reads the recipe. If this user has trained the run, permits importing the module of its task.
 
         Raises:
-            ValueError: this is no folder of a run, its configuration cannot be read, or a link in the folder
-                leads out of it, so that files would be written elsewhere.
+            ValueError: this is not the folder of a run, its configuration cannot be read, or a link in the
+                folder leads out of it, so that files would be written elsewhere.
         """
         if not self.config.is_file():
             inside = sorted(config.parent.name for config in self.path.glob("*/config.yaml"))
@@ -145,23 +146,23 @@ class RunFolder:
         return recipe
 
     def _check_links(self) -> None:
-        """Raises a ValueError if a link in the folder would lead writes elsewhere."""
+        """Raises a ValueError for a link through which files would be written outside of the folder."""
         home = self.path.resolve()
         for path in self.path.rglob("*"):
             top, *below = path.relative_to(self.path).parts
             if top == "wandb" and below and not below[0].startswith("run_id"):
-                continue  # wandb's links to logs, which it replaces and never writes through
+                continue  # wandb links to its logs, but replaces these links instead of writing through them
             if path.is_symlink() and not path.resolve().is_relative_to(home):
                 raise ValueError(f"{path} is a link that leads out of the run's folder: replace it by a copy")
 
     @property
     def is_done(self) -> bool:
-        """Whether the run has reached its last epoch and written all files; its policy comes last."""
+        """Whether the run has reached its last epoch and written its policy, which is its last file."""
         rows = self.rows() if self.config.exists() and self.policy.exists() else []
         return bool(rows) and rows[-1]["epoch"] >= self.recipe().run.epochs
 
     def write_table(self, rows: Sequence[dict[str, float]]) -> None:
-        """Writes the table of metrics."""
+        """Writes the table of metrics to ``metrics.csv``."""
         columns = list(dict.fromkeys(name for row in rows for name in row))
         table = io.StringIO()
         writer = csv.DictWriter(table, columns, restval="nan")
@@ -171,7 +172,7 @@ class RunFolder:
 
     @property
     def _parts(self) -> list[Path]:
-        """Returns temporary files, which exist only while others are written."""
+        """Paths of temporary files, to which the files of the folder are written before they are renamed."""
         return [part_of(path) for path in vars(self).values() if path != self.path]
 
     @property
@@ -182,11 +183,11 @@ class RunFolder:
 
     @property
     def older_checkpoints(self) -> list[Path]:
-        """The checkpoints before the newest one."""
+        """Existing checkpoints except the newest one."""
         return sorted(self.path.glob(f"{self.checkpoint.stem}.[0-9]*{self.checkpoint.suffix}"))
 
     def rows(self) -> list[dict[str, float]]:
-        """Reads the metrics table so far.
+        """Reads the table of metrics; returns an empty list if it was not written yet.
 
         Raises:
             ValueError: the table is damaged.
@@ -198,9 +199,9 @@ class RunFolder:
 
 
 def remember(config: Path, task: str) -> None:
-    """Records that this user has trained the run of a ``config.yaml``, if its task names a module.
+    """Records that this user has trained the run of a ``config.yaml``, so that resuming needs no permission.
 
-    Does nothing if the user's state directory cannot be written.
+    Does nothing if the run's task names no module, or if the user's state directory cannot be written.
     """
     if not foreign_module(task):
         return
@@ -214,7 +215,7 @@ def remember(config: Path, task: str) -> None:
 
 
 def is_own(config: Path) -> bool:
-    """Returns whether this user has trained the run of a ``config.yaml``, with this path and content."""
+    """Returns whether :func:`remember` recorded a ``config.yaml`` with this path and this content."""
     return _known().get(str(config.resolve())) == _digest(config)
 
 
@@ -224,7 +225,7 @@ def _state_file() -> Path:
 
 
 def _known() -> dict[str, str]:
-    """Reads the recorded digests by path."""
+    """Reads the record of :func:`remember`: digests of ``config.yaml`` files by path."""
     try:
         state = json.loads(_state_file().read_text())
     except (OSError, ValueError):

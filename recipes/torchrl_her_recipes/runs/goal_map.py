@@ -1,4 +1,4 @@
-"""Map of a run's virtual goals and their target, q and q* over a grid, as a file."""
+"""The class :class:`GoalMap`, histograms of a run's virtual goals and of their target, and its file."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from torchrl.data import TensorDictReplayBuffer
 from torchrl_her.files.writing import written
 from torchrl_her.goals.ibs import GoalHistogram
 
-_LARGEST = 1 << 27  # bytes of all arrays of a file
+_LARGEST = 1 << 27  # largest size of the arrays in a file, in bytes
 
 
 @dataclass(frozen=True)
 class GoalMap:
-    """Histograms over a grid of n x n goals on the screen: the first index goes right, the second up.
+    """Histograms of virtual goals over a grid with n cells along each of the goals' one to three coordinates.
 
     Attributes:
-        counts: [R, n, n], virtual goals of each run written since its buffer was last emptied; [R, n] for
-            goals of one coordinate, [R, n, n, n] for goals of three.
-        target: [n, n], q* at the final sigma.
+        counts: numbers of virtual goals that each run has written since its buffer was last emptied: [R, n,
+            n] for goals of two coordinates, where the first index is x and the second is y.
+        target: q* at the final sigma, [n, n].
     """
 
     counts: np.ndarray
@@ -31,12 +31,12 @@ class GoalMap:
 
     @property
     def share(self) -> np.ndarray:
-        """Returns q [n, n], the share of virtual goals in each cell, as the mean of the runs."""
+        """Distribution q [n, n] of virtual goals over the cells, averaged over the runs."""
         totals = self.counts.sum(tuple(range(1, self.counts.ndim)), keepdims=True)
         return (self.counts / np.maximum(totals, 1)).mean(0)
 
     def save(self, path: Path) -> None:
-        """Writes the map as a file of numpy arrays."""
+        """Writes the map to a file of numpy arrays (``.npz``)."""
         with written(path) as part:
             np.savez_compressed(part, counts=self.counts, target=self.target)
 
@@ -68,7 +68,7 @@ class GoalMap:
 
 
 def goal_map(buffer: TensorDictReplayBuffer, target: torch.Tensor | None) -> GoalMap | None:
-    """Returns the map of the runs' virtual goals and their q* [cells]; None if goals are not counted."""
+    """Makes the map from the counts of a buffer's goal weights and q* [cells]; None if they do not count."""
     counted = [weights for weights in buffer.writer.goal_weights if isinstance(weights, GoalHistogram)]
     if not counted or target is None:
         return None
@@ -78,7 +78,7 @@ def goal_map(buffer: TensorDictReplayBuffer, target: torch.Tensor | None) -> Goa
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Returns the arrays that ``numpy.savez`` wrote, if they hold numbers."""
+    """Reads the arrays of an ``.npz`` file by name; raises a ValueError if they are not arrays of numbers."""
     with open(path, "rb") as file:
         try:
             with ZipFile(file) as archive:
@@ -90,6 +90,6 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
             if odd := [name for name, array in arrays.items() if array.dtype.kind not in "biuf"]:
                 raise ValueError(f"{odd[0][:80]!r} holds no numbers")
             return arrays
-        except Exception as error:  # errors of any type: zlib's, zipfile's, those of Python's parser
+        except Exception as error:  # damaged files raise errors of many types, from zlib to Python's parser
             why = str(error) if type(error) is ValueError else f"it holds no arrays ({type(error).__name__})"
             raise ValueError(f"{path} is damaged: {why}") from error

@@ -1,4 +1,4 @@
-"""Handles Ctrl-C, or another request to end, so that work in progress can finish."""
+"""Handles Ctrl-C and similar signals, so that a run can save its state before it ends."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-_TOGETHER = 1.0  # seconds within which signals count as one
-_OTHERS = ("SIGTERM", "SIGHUP")  # sent by `kill`, job schedulers and closed terminals; not on all systems
+_TOGETHER = 1.0  # seconds within which several signals count as one
+_OTHERS = ("SIGTERM", "SIGHUP")  # from `kill`, job schedulers, closed terminals; missing on some systems
 
 
 class Interrupted(Exception):
-    """Raised at a good moment to stop, after Ctrl-C or another request to end."""
+    """Raised after Ctrl-C or a similar signal, at a moment when the run can be saved."""
 
 
 @contextmanager
 def soft_interrupt() -> Iterator[Callable[[], None]]:
     """Defers the first Ctrl-C until the yielded function is called; a second Ctrl-C takes effect at once.
 
-    SIGTERM and SIGHUP count as Ctrl-C, unless they are ignored, as under ``nohup``. Signals that
-    come together, as from a process group and its parent, count as one.
+    SIGTERM and SIGHUP count as Ctrl-C, unless they are ignored, as under ``nohup``. Signals within a second
+    count as one, since a process may get the same request twice: from its parent and from its process group.
 
     Example:
         >>> with soft_interrupt() as check:

@@ -1,4 +1,4 @@
-"""Notices about problems of a run, once for each run, with options that help."""
+"""Detects typical problems of training in the table of metrics, and suggests options that help."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from torchrl_her_recipes.config.recipe import Recipe
 
 Row = dict[str, float]  # row of the table of metrics: one epoch of one run
 
-_AT_BOUND = 0.99  # fraction of the way from the middle of the range to its end
+_AT_BOUND = 0.99  # an action is at its bound beyond this fraction of the way from the middle of its range
 _NEARLY_ALL = 0.95  # fraction of the entries of all actions, or of virtual rows, that counts as nearly all
 _STREAK = 3  # epochs in a row that show a problem before it is reported
-_LONG = 5
-_LITTLE = 0.5  # success; above it, actions at their bounds may well be right
-_FEW = 0.02  # fraction of the transitions
-_BEYOND = 0.25  # fraction of the range of returns
+_LONG = 5  # the same for problems that may pass by themselves
+_LITTLE = 0.5  # success rate below which there is a problem; above it, actions at their bounds may be right
+_FEW = 0.02  # fraction of the transitions that counts as few
+_BEYOND = 0.25  # fraction of the range of returns by which values must exceed the range to be reported
 
 
 def saturation(action: Tensor, low: Tensor, high: Tensor) -> Tensor:
-    """Computes the fraction of an action's entries that are at their bounds.
+    """Computes the fraction of each action's entries that are at their bounds.
 
     Args:
         action: [..., a].
@@ -46,21 +46,18 @@ def saturation(action: Tensor, low: Tensor, high: Tensor) -> Tensor:
 
 
 def notices(rows: Sequence[Row], recipe: Recipe, bounds: tuple[float, float]) -> list[str]:
-    """Returns a line for each problem that appears in the newest epoch for the first time.
+    """Returns a message for each problem that appears for the first time in the newest epoch.
 
     Args:
         rows: the table of metrics so far, one row for each epoch and run.
         recipe: recipe of the runs.
-        bounds: the least and the greatest reward; infinite if there are none.
-
-    Returns:
-        The lines; an empty list if there is no new problem.
+        bounds: the least and the greatest reward; infinite if rewards have no bounds.
     """
     runs: dict[float, list[Row]] = {}
     for row in rows:
         runs.setdefault(row["run"], []).append(row)
     task, learner = recipe.task.name, recipe.learner
-    rules = [  # each returns a problem of a run, given its rows
+    rules = [  # each takes the rows of a run, and returns a message if they show its problem
         partial(_nothing_achieved, task),
         partial(_nothing_to_relabel, task, recipe.hindsight.algorithm),
         partial(_saturated, learner),
@@ -82,7 +79,7 @@ def notices(rows: Sequence[Row], recipe: Recipe, bounds: tuple[float, float]) ->
 
 
 def _success(row: Row) -> float:
-    return row.get("stage_success", row["success"])  # in a curriculum, at the goals of the present stage
+    return row.get("stage_success", row["success"])  # in a curriculum, success at the current stage's goals
 
 
 def _nothing_achieved(task: str, rows: Sequence[Row]) -> str | None:
@@ -116,7 +113,7 @@ def _nothing_to_relabel(task: str, algorithm: Algorithm, rows: Sequence[Row]) ->
 
 
 def _saturated(learner: LearnerConfig, rows: Sequence[Row]) -> str | None:
-    """Reports actions at their bounds, where an actor that ends in tanh gets almost no gradient."""
+    """Reports actions at their bounds, where an actor that ends in tanh has almost no gradient."""
     last = rows[-_STREAK:]
     stuck = [row.get("saturation", 0.0) >= _NEARLY_ALL and _success(row) < _LITTLE for row in last]
     if len(last) < _STREAK or not all(stuck):
@@ -126,13 +123,13 @@ def _saturated(learner: LearnerConfig, rows: Sequence[Row]) -> str | None:
         helps.insert(0, f"saturation_penalty above {penalty:g}")
     return (
         f"nearly all greedy actions have been at their bounds for {_STREAK} epochs (now "
-        f"{last[-1]['saturation']:.0%}), with {_success(last[-1]):.0%} success; this actor may not learn "
-        f"any more. What helps: {' or '.join(helps)}"
+        f"{last[-1]['saturation']:.0%}), with {_success(last[-1]):.0%} success; the actor may have stopped "
+        f"learning. What helps: {' or '.join(helps)}"
     )
 
 
 def _beyond(learner: LearnerConfig, bounds: tuple[float, float], rows: Sequence[Row]) -> str | None:
-    """Reports values of the critic that are outside of the range of possible returns."""
+    """Reports critics whose values of starts are outside of the range of possible returns."""
     gamma = float(learner.gamma)
     horizon = 1 / (1 - gamma) if gamma < 1 else math.inf
     low, high = min(0.0, horizon * bounds[0]), max(0.0, horizon * bounds[1])
@@ -145,8 +142,8 @@ def _beyond(learner: LearnerConfig, bounds: tuple[float, float], rows: Sequence[
     if not getattr(learner, "clamp_targets", True):
         helps.insert(0, "clamp_targets=true")
     return (
-        f"the value of the starts is {last[-1]['q']:.4g}, and returns are from {low:.4g} to {high:.4g}: "
-        f"the critic diverges. What helps: {' or '.join(helps)}"
+        f"the critic gives starts a mean value of {last[-1]['q']:.4g}, but returns are between {low:.4g} and "
+        f"{high:.4g}: it diverges. What helps: {' or '.join(helps)}"
     )
 
 
@@ -180,5 +177,5 @@ def _differ(runs: Sequence[Sequence[Row]]) -> bool:
 
 
 def _means(values: Sequence[float]) -> list[float]:
-    """Computes the moving average of values, over the number of epochs that a problem must last."""
+    """Computes the moving average of values over ``_STREAK`` epochs."""
     return [sum(values[end - _STREAK : end]) / _STREAK for end in range(_STREAK, len(values) + 1)]

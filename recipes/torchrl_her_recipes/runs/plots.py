@@ -1,4 +1,4 @@
-"""Plots of a run: its curves, and heat maps of its virtual goals."""
+"""Draws curves of metrics over environment steps, and heat maps of virtual goals."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from torchrl_her_recipes.runs.goal_map import GoalMap
 
 Rows = Sequence[dict[str, float]]
 
-COLORS = {  # colors of algorithms, equal in all pictures; other labels take unused ones in this order
+COLORS = {  # color of each algorithm in all pictures; other labels use the remaining colors in this order
     "her": "#dd6b20",
     "filtered_her": "#805ad5",
     "filtered_her_ibs": "#2b6cb0",
@@ -33,13 +33,13 @@ COLORS = {  # colors of algorithms, equal in all pictures; other labels take unu
     "unfiltered_cher_ibs": "#975a16",
 }
 _REGIONS = {"goals": "#63b3ed", "reach": "#fc8181"}
-_MOST_LINES = 15  # runs that are drawn one by one
-_MOST_COLUMNS = 6  # panels beside each other
-_SCREEN = 300  # pixels of the picture behind a heat map
+_MOST_LINES = 15  # largest number of runs for which each run has a line of its own
+_MOST_COLUMNS = 6  # largest number of panels side by side
+_SCREEN = 300  # width and height in pixels of the picture behind a heat map
 
 
 def plot_curves(rows: Rows, path: Path, *, title: str = "") -> None:
-    """Draws the curves of a run. For several runs, draws median, 33rd to 67th percentile, and each run."""
+    """Draws the main metrics over environment steps; for several runs, with median and percentiles."""
     figure = Figure(figsize=(14, 6), layout="constrained")
     figure.suptitle(title)
     for axes, (name, label, limits) in zip(figure.subplots(2, 3).flat, PANELS, strict=True):
@@ -72,12 +72,12 @@ def save_figure(figure: Figure, path: Path) -> None:
 def plot_comparison(
     panels: Mapping[str, Mapping[str, Rows]], path: Path, *, metrics: Sequence[str] = ("success",)
 ) -> None:
-    """Draws metrics over environment steps: medians, and the 33rd to 67th percentile of the runs.
+    """Draws metrics over environment steps as medians with bands from the 33rd to the 67th percentile.
 
     Args:
-        panels: title of each panel to its curves, which map labels to tables of metrics.
+        panels: for each title of a panel, its curves; for each label of a curve, the table of its runs.
         path: path of the picture.
-        metrics: metrics to draw, one panel each; with several titles, each metric has a row of panels.
+        metrics: metrics to draw. With several of them and several titles, each metric has a row of panels.
     """
     columns = [(title, curves, name) for name in metrics for title, curves in panels.items()]
     rows = len(metrics) if len(panels) > 1 else 1
@@ -101,7 +101,7 @@ def plot_comparison(
 
 
 def colors(labels: Sequence[str]) -> dict[str, str]:
-    """Returns a color for each label: a fixed one for algorithms, the remaining ones in turn for others.
+    """Returns a color for each label: a fixed color for algorithms, the unused colors in turn for others.
 
     Example:
         >>> colors(["her", "window=20"])
@@ -113,7 +113,7 @@ def colors(labels: Sequence[str]) -> dict[str, str]:
 
 
 def draw_curves(axes: Axes, curves: Mapping[str, Rows], name: str, palette: Mapping[str, str]) -> None:
-    """Draws a metric of several algorithms over environment steps, on given axes."""
+    """Draws curves of one metric over environment steps on given axes, with labels and limits."""
     for label, rows in curves.items():
         draw_curve(axes, rows, name, color=palette[label], label=label)
     label, limits = AXES[name]
@@ -125,13 +125,13 @@ def draw_curves(axes: Axes, curves: Mapping[str, Rows], name: str, palette: Mapp
 
 
 def count_frames(axes: Axes) -> None:
-    """Labels the x axis with environment steps, with room between the numbers."""
+    """Formats the x axis for environment steps: few ticks, with numbers such as 200k."""
     axes.xaxis.set_major_locator(MaxNLocator(5))
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
 
 
 def stage_changes(rows: Rows) -> list[float]:
-    """Returns the numbers of frames after which runs moved to another stage of their curriculum."""
+    """Returns the numbers of frames after which a run entered another stage of its curriculum."""
     last: dict[float, dict[str, float]] = {}
     changes = []
     for row in rows:
@@ -150,7 +150,7 @@ def draw_curve(
     color: str = "#2b6cb0",
     label: str | None = None,
 ) -> None:
-    """Draws a metric over environment steps, on given axes: median, 33rd to 67th percentile, single runs."""
+    """Draws one metric of some runs on given axes: median, 33rd to 67th percentile, and single runs."""
     frames, low, middle, high = band(rows, name)
     runs = by_frames(rows, name)[1]
     if 1 < runs.shape[1] <= _MOST_LINES:
@@ -160,14 +160,14 @@ def draw_curve(
 
 
 def band(rows: Rows, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Returns numbers of frames, and the 33rd, 50th and 67th percentile of a metric after them, [n] each."""
+    """Returns the frames of n evaluations and a metric's 33rd, 50th and 67th percentile there, [n] each."""
     frames, values = by_frames(rows, name)
     low, middle, high = np.percentile(values, [33, 50, 67], axis=1)
     return frames, low, middle, high
 
 
 def by_frames(rows: Rows, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the numbers of frames [n] of the evaluations, and a metric of the R runs there, [n, R]."""
+    """Returns the frames [n] of n evaluations, and the values [n, R] of a metric of R runs."""
     if missing := [row for row in rows if name not in row]:
         raise ValueError(f"these runs did not measure {name}; they have {', '.join(missing[0])}")
     groups: dict[float, list[float]] = {}
@@ -177,7 +177,7 @@ def by_frames(rows: Rows, name: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def plot_goals(goals: GoalMap, env: GoalEnv, path: Path, *, title: str = "") -> None:
-    """Draws a heat map of virtual goals beside a heat map of their target q*, in the same colors."""
+    """Draws heat maps of virtual goals and of their target q*, side by side, with the same color scale."""
     figure = Figure(figsize=(9.6, 4.6), layout="constrained")
     figure.suptitle(title)
     limit = max(float(goals.target.max()), 1e-9)
@@ -192,13 +192,13 @@ def plot_goals(goals: GoalMap, env: GoalEnv, path: Path, *, title: str = "") -> 
 
 
 def draw_goals(axes: Axes, share: np.ndarray, env: GoalEnv, *, limit: float) -> None:
-    """Draws a heat map [n, n] over a picture of the environment, on given axes; colors end at ``limit``.
+    """Draws a heat map [n, n] over a picture of the environment; its color scale ends at ``limit``.
 
-    The environment gives the box of its goals, the edges of its picture, and the regions that are worth
-    drawing. Without a picture the heat map is drawn on white.
+    The environment defines the box of its goals, the edges of its picture, and regions to outline. If it has
+    no picture, the heat map is drawn on white.
 
     Raises:
-        ValueError: the environment's goals do not lie in a box of two dimensions.
+        ValueError: the environment does not define a two-dimensional box of goals.
     """
     box = env.goal_box()
     if box is None or len(box[0]) != 2:
@@ -210,7 +210,7 @@ def draw_goals(axes: Axes, share: np.ndarray, env: GoalEnv, *, limit: float) -> 
         axes.imshow(env.render(0, size=_SCREEN).numpy(), extent=_extent(frame))
     (left, bottom), (right, top) = box
     heat = share.T
-    alpha = np.clip(heat / limit, 0.0, 1.0) ** 0.5  # cells with few goals leave the picture visible
+    alpha = np.clip(heat / limit, 0.0, 1.0) ** 0.5  # the picture stays visible where there are few goals
     axes.imshow(heat, origin="lower", cmap="magma", vmin=0.0, vmax=limit, alpha=alpha, extent=_extent(box))
     for name, ((x, y), (x_end, y_end)) in env.regions().items():
         color = _REGIONS.get(name, "#718096")
@@ -221,6 +221,6 @@ def draw_goals(axes: Axes, share: np.ndarray, env: GoalEnv, *, limit: float) -> 
 
 
 def _extent(box: Box) -> tuple[float, float, float, float]:
-    """Converts a box to the form of matplotlib."""
+    """Converts a box to matplotlib's ``extent``: left, right, bottom, top."""
     (left, bottom), (right, top) = box
     return left, right, bottom, top

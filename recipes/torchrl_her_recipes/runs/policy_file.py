@@ -1,4 +1,4 @@
-"""Files of policies: weights in safetensors, and a description in the header."""
+"""Writes and reads files of policies: weights as safetensors, with a description in the header."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ def write_policy(path: Path, weights: Mapping[str, Tensor], description: Mapping
     """Writes weights and their description; an interrupted write leaves no partial file.
 
     Args:
-        path: The file.
-        weights: ``state_dict()`` of a policy. Entries that are not tensors are left out.
-        description: Plain values that can be written as JSON.
+        path: Path of the file.
+        weights: ``state_dict()`` of a policy. Entries that are not tensors are not written.
+        description: Plain values that JSON can represent.
     """
     tensors = {
-        name: value.detach().to("cpu", copy=True).contiguous()  # safetensors refuses shared storage
+        name: value.detach().to("cpu", copy=True).contiguous()  # safetensors refuses shared memory
         for name, value in weights.items()
         if isinstance(value, Tensor)
     }

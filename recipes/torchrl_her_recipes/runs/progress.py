@@ -1,4 +1,4 @@
-"""Shows the progress of a run: a bar on a terminal, lines elsewhere."""
+"""Shows the progress of a run: as a bar on a terminal, and as lines in a file."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from torchrl_her.trainers.trainer import Trainer
 class Progress:
     """Shows the progress of a run on the standard error stream.
 
-    On a terminal, shows a bar; if the stream goes to a file or another program, a line for each epoch.
+    On a terminal, this is a bar. If the stream goes to a file or another program, it is a line per epoch.
     """
 
     def __init__(self, trainer: Trainer, *, epochs: int, frames: int, show: bool) -> None:
@@ -44,10 +44,10 @@ class Progress:
             tqdm.write(line, file=sys.stderr)
 
     def say(self, line: str) -> None:
-        """Writes a notice to the standard output, above the bar if there is one."""
+        """Writes a message to the standard output, above the bar if there is one."""
         if self.show:
             tqdm.write(line)
 
     def close(self) -> None:
-        """Ends the bar."""
+        """Closes the bar, which stays on the screen."""
         self.bar.close()

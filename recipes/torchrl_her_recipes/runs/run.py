@@ -1,4 +1,4 @@
-"""Runs from beginning to end: training, evaluation, recording, checkpoints, resuming."""
+"""Trains runs and resumes them: the loop of training, evaluation and saving."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ from torchrl_her_recipes.runs.virtual_goals import at_virtual_goals
 
 @dataclass(frozen=True)
 class RunResult:
-    """The result of a run, or of several side by side.
+    """The result of a run, or of several runs side by side.
 
     Attributes:
         rows: the table of metrics, with a row for each epoch and run.
@@ -58,18 +58,18 @@ class RunResult:
 
     @property
     def successes(self) -> list[float]:
-        """Success rate of each run in the last evaluation; empty if there was none."""
+        """Success rate of each run in the last evaluation; empty if there was no evaluation."""
         return last_success(self.rows)
 
     @property
     def reached(self) -> float:
-        """Share of goals achieved at some step in the last evaluation, the median of the runs."""
+        """Share of the goals in the last evaluation that were achieved at some step; median of the runs."""
         last = self.rows[-len(self.successes) :]
         return statistics.median(row.get("reached", row["success"]) for row in last) if last else 0.0
 
     @property
     def success(self) -> float:
-        """Success rate in the last evaluation, the median of the runs; 0 if there was none."""
+        """Success rate in the last evaluation, as the median of the runs; 0 if there was no evaluation."""
         return statistics.median(self.successes) if self.rows else 0.0
 
 
@@ -83,14 +83,14 @@ def run(
     """Trains for the recipe's number of epochs.
 
     Args:
-        components: from :func:`~torchrl_her_recipes.build`; you may have replaced some of them.
+        components: components from :func:`~torchrl_her_recipes.build`, some of which may be replaced.
         folder: folder for the run's files; None writes nothing.
-        callbacks: called on the way; they may stop the run.
-        progress: whether to show a progress bar, or a line for each epoch where there is no terminal.
+        callbacks: user code that is called during training and can stop the run.
+        progress: whether to show a progress bar, or a line for each epoch if there is no terminal.
 
     Raises:
-        ValueError: the folder holds a run already, or a logger cannot be opened.
-        ImportError: a logger's package is not installed.
+        ValueError: the folder already has a run, or a logger cannot be opened.
+        ImportError: the package of a logger is not installed.
 
     Example:
         >>> from torchrl_her_recipes import EarlyStopping, build, make_recipe
@@ -101,13 +101,13 @@ def run(
     """
     current = _Run(components, None if folder is None else RunFolder(folder))
     with torch.random.fork_rng(devices=[]), ExitStack() as stack:
-        # Losses and policies of TorchRL draw from torch's own generator.
+        # Losses and policies of TorchRL draw random numbers from torch's global generator.
         torch.manual_seed(components.recipe.run.seed)
         if current.home is not None:
             check_installed(components.recipe.run.log)
             current.home.create()
             stack.enter_context(current.home.at_work())
-            # Saved before config.yaml is written: a folder with one can be resumed.
+            # The checkpoint is written before config.yaml, so that a folder with config.yaml can be resumed.
             current.save(current.home, goals=False)
             current.home.describe(components.recipe)
         return current.train(callbacks, progress=progress)
@@ -120,21 +120,21 @@ def run_score(
     callbacks: Sequence[Callback] = (),
     progress: bool = False,
 ) -> float:
-    """Trains, and returns the score of the result, which any program for searches can maximize.
+    """Trains a recipe and returns a score, which any program that searches for good options can maximize.
 
     Args:
-        recipe: its ``num_runs`` runs are trained side by side; the score is their median.
+        recipe: recipe of the runs. The score is the median over its ``num_runs`` runs.
         folder: folder for the run's files; None writes nothing.
-        callbacks: called on the way; they may stop the run.
-        progress: whether to show a progress bar, or a line for each epoch where there is no terminal.
+        callbacks: user code that is called during training and can stop the run.
+        progress: whether to show a progress bar, or a line for each epoch if there is no terminal.
 
     Raises:
-        ValueError: the folder holds a run already.
+        ValueError: the folder already has a run.
         KeyboardInterrupt: Ctrl-C was pressed. If a folder was given, the unfinished run is saved in it.
     """
     result = run(build(recipe), folder, callbacks=callbacks, progress=progress)
     if result.interrupted:
-        raise KeyboardInterrupt  # otherwise, a search would take an unfinished run for a bad one
+        raise KeyboardInterrupt  # a search must not take the low score of an unfinished run for its result
     return score(result.rows)
 
 
@@ -146,31 +146,31 @@ def resume(
     callbacks: Sequence[Callback] = (),
     progress: bool = True,
 ) -> RunResult:
-    """Continues a run from its newest complete checkpoint, or extends one that has ended.
+    """Continues an unfinished run from its newest complete checkpoint, or adds epochs to a finished run.
 
-    A finished run can be given more epochs only if its recipe has ``keep_buffer=True``. Otherwise its last
-    checkpoint has no replay buffer, and only its pictures and its policy are made again.
+    Epochs can be added to a finished run only if its recipe has ``keep_buffer=True``. Otherwise its last
+    checkpoint has no replay buffer, and resuming only makes its pictures and its policy again.
 
-    With this library's tasks, the run ends bit for bit like a run that never stopped. Environments of
-    gymnasium and your own are seeded anew in each epoch, so for them this holds if the run stopped between
-    two epochs. After a stop within an epoch, the rest of that epoch consists of new episodes. Such an
-    environment must draw only from the generator that it seeds, and keep no state from earlier episodes.
+    With this library's tasks, a resumed run ends bit for bit like a run that never stopped. Environments of
+    gymnasium and of users are seeded again in each epoch. With these, a run that stopped between two epochs
+    ends bit for bit the same, if an environment draws only from the generator that it seeds and keeps no
+    state from earlier episodes. If the run stopped within an epoch, the rest of that epoch has new episodes.
 
     Args:
         folder: folder of the run.
-        components: newly made components, if the run had other components than its recipe makes.
-        options: other values of ``epochs``, ``checkpoint_interval``, ``keep_checkpoints``, ``keep_buffer``,
-            ``pictures`` or ``log``, which are written into the folder's configuration.
-        callbacks: called on the way; they may stop the run. Callbacks of the first start are not kept.
-        progress: whether to show a progress bar, or a line for each epoch where there is no terminal.
+        components: newly made components, if components of the run were replaced after ``build``.
+        options: new values of ``epochs``, ``checkpoint_interval``, ``keep_checkpoints``, ``keep_buffer``,
+            ``pictures`` or ``log``, which are written to the folder's configuration.
+        callbacks: user code that is called during training; callbacks of earlier starts are not saved.
+        progress: whether to show a progress bar, or a line for each epoch if there is no terminal.
 
     Raises:
         ValueError: there is no run in the folder, no checkpoint is complete, more epochs need a replay buffer
-            that the checkpoint lacks, an option would change the training so far, ``epochs`` is less than
-            was done, both options and components are given, or the components differ from the run's.
+            that the checkpoint lacks, an option would change the training done so far, ``epochs`` is below
+            the number done, both options and components are given, or the components do not fit the run.
     """
     home = RunFolder(folder)
-    home.recipe()  # raises before a lock is left in a folder that is not a run's
+    home.recipe()  # raises if this is not the folder of a run, before a lock file is written to it
     if options and components is not None:
         raise ValueError("give resume() either options or components that were made with them, not both")
     with home.at_work():
@@ -190,7 +190,7 @@ def resume(
 
 
 def _newest_state(home: RunFolder, *, keep: int) -> tuple[dict[str, Any], int, bool]:
-    """Returns the newest complete checkpoint, its number of epochs, and whether it has a replay buffer."""
+    """Reads the newest complete checkpoint; returns it, its epoch, and whether it has a replay buffer."""
     try:
         state = load_newest_checkpoint(home.checkpoint, keep=keep)
     except FileNotFoundError:
@@ -204,7 +204,7 @@ def _newest_state(home: RunFolder, *, keep: int) -> tuple[dict[str, Any], int, b
 def _check_extension(
     home: RunFolder, options: RunConfig, done: int, *, has_buffer: bool, asked: bool
 ) -> None:
-    """Raises an error if a run cannot continue with its options after the epochs that it has done."""
+    """Raises a ValueError if a run cannot continue with the given options after ``done`` epochs."""
     if not has_buffer and (options.epochs > done or options.keep_buffer):
         raise ValueError(
             f"the run in {home.path} cannot be extended beyond {done} epochs: its checkpoint has no "
@@ -218,7 +218,7 @@ def _check_extension(
 
 
 class _Run:
-    """A run, or several side by side, with its folder."""
+    """A run in progress (or several runs side by side): components, table of metrics and folder."""
 
     def __init__(self, components: Components, home: RunFolder | None) -> None:
         self.components, self.recipe, self.home = components, components.recipe, home
@@ -228,37 +228,37 @@ class _Run:
         self.has_buffer = True
 
     def go_back(self, home: RunFolder, epochs: int, *, has_buffer: bool) -> None:
-        """Restores the table and the best policy as of the given epoch, and removes newer files."""
-        home.policy.unlink(missing_ok=True)  # left by an earlier stop; only finished runs must have it
+        """Restores table and best policy as they were after ``epochs`` epochs, and removes newer files."""
+        home.policy.unlink(missing_ok=True)  # written when the run stopped, but marks a finished run
         if self.best.state is None:
-            # The best policy's file may be newer than the checkpoint, as the last rows of the table may be.
+            # Best policy and table are written each epoch, so their files may be newer than the checkpoint.
             home.best.unlink(missing_ok=True)
         self.save_best(home)
         self.rows, self.has_buffer = home.rows()[: epochs * self.recipe.run.num_runs], has_buffer
 
     @property
     def has_ended(self) -> bool:
-        """Whether the last epoch is finished."""
+        """Whether the run has finished its last epoch."""
         return self.trainer.epochs >= self.recipe.run.epochs
 
     def train(self, callbacks: Sequence[Callback], *, progress: bool) -> RunResult:
-        """Trains, evaluates and saves until the last epoch, or until something stops it before."""
+        """Trains, evaluates and saves up to the last epoch, or until a callback or a signal stops the run."""
         recipe, trainer, rows, home = self.recipe, self.trainer, self.rows, self.home
         loggers = [] if home is None else [LogByName(name) for name in recipe.run.log]
         hooks, view = [*callbacks, *loggers], RunView(self.components, trainer, rows, home)
         threads = torch.get_num_threads()
         torch.set_num_threads(recipe.run.threads)
-        torch.set_flush_denormal(True)  # Adam's moments of unused weights become denormal: ten times slower
+        torch.set_flush_denormal(True)  # denormal moments of Adam, of unused weights, are ten times slower
         display = Progress(trainer, epochs=recipe.run.epochs, frames=recipe.total_frames, show=progress)
         interrupted = stopped = saved = False
-        with soft_interrupt() as check, ExitStack() as opened:  # covers saving at the end
+        with soft_interrupt() as check, ExitStack() as opened:  # also defers Ctrl-C while files are saved
             for logger in loggers:
                 opened.callback(logger.close)
 
             def on_batch(_trainer: Trainer) -> None:
                 display.batch()
                 check()
-                stops = [hook.on_batch(view) for hook in hooks]  # calls all of them, also after a True
+                stops = [hook.on_batch(view) for hook in hooks]  # all are called, even if one returns True
                 if any(stops):
                     raise Stopped
 
@@ -299,7 +299,7 @@ class _Run:
         )
 
     def epoch(self, on_batch: Callable[[Trainer], None], display: Progress) -> None:
-        """Runs an epoch and its evaluation; returns new rows of the table, one for each run."""
+        """Trains for an epoch, evaluates, and adds a row for each run to the table of metrics."""
         components, trainer, state = self.components, self.trainer, self.components.curriculum
         began = time.perf_counter()
         seed_epoch(components.env, self.recipe.seeds, self.recipe.collection.processes, trainer)
@@ -323,7 +323,7 @@ class _Run:
                     run
                 )
             rows.append({**counters, **times, **values, **written(components, run)})
-        self.best.see(rows, components.greedy)  # before a new stage changes what success means
+        self.best.see(rows, components.greedy)  # before runs move to new stages
         if state is not None:
             for line in move_on(components, state, samples, trainer.frames):
                 display.say(line)
@@ -331,7 +331,7 @@ class _Run:
         self.rows += rows
 
     def save(self, home: RunFolder, *, goals: bool = True) -> bool:
-        """Writes a checkpoint; returns whether that succeeded. The last checkpoint has no replay buffer.
+        """Writes a checkpoint, at the end without replay buffer; returns whether this succeeded.
 
         Unless ``goals`` is False, writes the histogram of virtual goals first, since it needs the buffer.
         """
@@ -345,7 +345,7 @@ class _Run:
         return False
 
     def save_best(self, home: RunFolder) -> None:
-        """Writes the best policy if it has changed."""
+        """Writes the best policy if it has changed since the last call."""
         if self.best.state is not None and self.best.is_new:
             with self._despite_a_full_disk("best policy"):
                 described = {name: self.best.state[name] for name in ("epoch", "success")}
@@ -354,7 +354,7 @@ class _Run:
                 self.best.is_new = False
 
     def save_goals(self, home: RunFolder) -> GoalMap | None:
-        """Writes the histogram of virtual goals and returns it; without a buffer, reads the earlier file."""
+        """Writes and returns the histogram of virtual goals; without a buffer, reads the earlier file."""
         if not self.has_buffer:
             return GoalMap.load(home.goal_map) if home.goal_map.is_file() else None
         goals = goal_map(self.components.buffer, self.components.goal_target)
@@ -364,7 +364,7 @@ class _Run:
 
     @contextmanager
     def _despite_a_full_disk(self, what: str) -> Iterator[None]:
-        """Turns a failure to write a file into a warning; the next epoch tries again."""
+        """Turns a failure to write a file into a warning, since the next epoch tries again."""
         try:
             yield
         except OSError as error:
@@ -375,7 +375,7 @@ class _Run:
         """Draws the pictures and then writes the policy, whose file marks the run as finished.
 
         Raises:
-            OSError: a file cannot be written; the message says which are missing.
+            OSError: a file cannot be written; the message lists the missing files.
         """
         try:
             goals = self.save_goals(home)

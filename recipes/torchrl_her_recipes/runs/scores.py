@@ -1,4 +1,4 @@
-"""Scores of runs: their last evaluation, the score that searches maximize, the best policy."""
+"""Summarizes evaluations of runs: results at the end, the score that searches maximize, the best policy."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from typing import Any
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-LAST = 3  # number of last evaluations whose mean is a run's result
-_SCORED = 5  # number of last evaluations whose mean searches maximize
+LAST = 3  # number of evaluations, the last ones, whose mean is the result of a run
+_SCORED = 5  # number of evaluations, the last ones, whose mean is the score of a run in searches
 
 
 def at_the_end(rows: Sequence[dict[str, float]], name: str, *, evaluations: int = LAST) -> list[float]:
-    """Returns a metric of each run: the mean of its last evaluations.
+    """Returns a metric at the end of each run, as the mean of its last ``evaluations`` evaluations.
 
     Returns:
         One number for each run, in the order of the runs.
@@ -42,14 +42,14 @@ def median_run(rows: Sequence[dict[str, float]]) -> int:
 
 
 def score(rows: Sequence[dict[str, float]], *, last: int = _SCORED) -> float:
-    """Computes the score for searches: the median of the runs' mean success in the last evaluations.
+    """Computes the score that searches maximize: the median over the runs of mean success at the end.
 
     Args:
         rows: the table of metrics, with a row for each epoch and run.
-        last: number of evaluations; all of them if there are fewer.
+        last: number of evaluations, the last ones, over which success is averaged.
 
     Returns:
-        From 0 to 1; 0 if there was no evaluation.
+        A number from 0 to 1; 0 if there was no evaluation.
 
     Raises:
         ValueError: ``last`` is below 1.
@@ -66,14 +66,13 @@ def score(rows: Sequence[dict[str, float]], *, last: int = _SCORED) -> float:
 
 
 class BestPolicy:
-    """The policy of the evaluation with the best success so far, or of the latest one if several are equal.
+    """Keeps the policy with the best success in an evaluation; if several are equal, the latest.
 
-    If several runs are trained side by side, their median success counts, and the policies of all are kept.
+    If several runs are trained side by side, their median success decides, and all their policies are kept.
 
     Attributes:
-        state: the weights ``actor``, and the ``epoch`` and ``success`` of the evaluation; None before the
-            first evaluation.
-        is_new: whether the state has to be written; set it to False when it is written.
+        state: weights (``actor``), ``epoch`` and ``success`` of the best evaluation; None before the first.
+        is_new: whether the state was not written to a file yet; the caller sets it to False after writing.
 
     Example:
         >>> from torchrl_her.modules import make_actor
@@ -97,7 +96,7 @@ class BestPolicy:
         self.state, self.is_new = state, state is not None
 
     def see(self, rows: Sequence[dict[str, float]], actor: TensorDictModuleBase) -> None:
-        """Keeps a policy if its evaluation is at least as good as the best evaluation before."""
+        """Keeps a policy if its median success, in ``rows`` of an evaluation, is at least the best so far."""
         success = statistics.median(row["success"] for row in rows)
         if self.state is not None and success < self.state["success"]:
             return

@@ -1,4 +1,4 @@
-"""The whole state of a run as tensors and plain data, from which it resumes bit for bit."""
+"""Collects the state of a run as tensors and plain data, and restores it, so that runs resume bit for bit."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from torchrl_her_recipes.components.components import Components
 from torchrl_her_recipes.components.devices import place_of
 
 _NETWORKS = ("loss", "optimizer", "target", "exploration", "norm", "average", "guide")
-_ROWS = ("buffer", "demonstrations")  # parts with transitions, the largest ones of a checkpoint
+_ROWS = ("buffer", "demonstrations")  # parts that hold transitions, which make checkpoints large
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Part:
 
 
 def parts_of(components: Components, trainer: Trainer) -> dict[str, Any]:
-    """Returns all parts of a run that have a state, by name, in the order in which they are loaded."""
+    """Returns the parts of a run that have a state, by name, in the order in which states are restored."""
     buffer, collector, state = components.buffer, components.collector, components.curriculum
     guide, generators, device = components.guide, components.generators, place_of(components.loss)
     worlds = _worlds(components.env, components.recipe.collection.processes)
@@ -49,8 +49,8 @@ def parts_of(components: Components, trainer: Trainer) -> dict[str, Any]:
         for name, value in _made_of(components).items():
             if value != made_of[name]:
                 raise ValueError(
-                    f"the run's {name} was {made_of[name]}, not {value}: give resume() components made as "
-                    "its were"
+                    f"the run's {name} was {made_of[name]}, not {value}: give resume() components like those "
+                    "that the run began with"
                 )
 
     def load_progress(progress: dict[str, Any]) -> None:
@@ -60,7 +60,7 @@ def parts_of(components: Components, trainer: Trainer) -> dict[str, Any]:
             set_stage_goals(buffer.writer, state.progress.stage_of(run), run=run)
 
     def begin_episodes(_state: dict[str, Any]) -> None:
-        if trainer.in_epoch:  # the environments' state is not saved: their episodes cannot resume
+        if trainer.in_epoch:  # new episodes, since the state of these environments cannot be saved
             collector.reset()
             if isinstance(buffer.writer, HERWriter):
                 buffer.writer.end_episodes()
@@ -73,7 +73,7 @@ def parts_of(components: Components, trainer: Trainer) -> dict[str, Any]:
             partial(buffer_state_dict, buffer, copy=False), partial(load_buffer_state_dict, buffer)
         ),
         "generators": Part(partial(generator_states, generators), partial(set_generator_states, generators)),
-        # For losses that draw random numbers, as SAC's.
+        # For losses that draw random numbers from the global generators, such as SAC's.
         "torch_generator": Part(torch.get_rng_state, torch.set_rng_state),
         "cuda_generator": None
         if device.type != "cuda" or not torch.cuda.is_initialized()
@@ -81,7 +81,7 @@ def parts_of(components: Components, trainer: Trainer) -> dict[str, Any]:
             partial(torch.cuda.get_rng_state, device), partial(torch.cuda.set_rng_state, device=device)
         ),
         "progress": None if state is None else Part(state.progress.state_dict, load_progress),
-        "demonstrations": components.demonstrations,  # rewards need the stage in the progress
+        "demonstrations": components.demonstrations,  # after "progress": rewards depend on the stage
         "collector": Part(
             partial(collector_state_dict, collector), partial(load_collector_state_dict, collector)
         ),
@@ -94,23 +94,23 @@ def parts_of(components: Components, trainer: Trainer) -> dict[str, Any]:
 
 
 def run_state(parts: dict[str, Any], *, buffer: bool = True) -> dict[str, Any]:
-    """Returns the states of parts as tensors and plain data.
+    """Returns the state of each part as tensors and plain data.
 
     Args:
         parts: parts from :func:`parts_of`.
 
     Keyword Args:
-        buffer: whether to include transitions, of demonstrations too; a run cannot continue without them.
-            They are views of the buffer: save them before it changes.
+        buffer: whether to include all transitions, without which training cannot continue. Their tensors
+            share memory with the replay buffers: save them before the buffers change.
     """
     return {name: part.state_dict() if buffer or name not in _ROWS else None for name, part in parts.items()}
 
 
 def load_run_state(parts: dict[str, Any], state: dict[str, Any]) -> None:
-    """Restores a state from :func:`run_state` in newly built parts; a buffer without state stays empty.
+    """Restores a state from :func:`run_state` in newly built parts; without transitions, buffers stay empty.
 
     Raises:
-        ValueError: the state has other parts, or the parts have other types or other settings.
+        ValueError: the state is of other parts, or of parts with other types or settings.
     """
     if others := sorted(parts.keys() ^ state.keys()):
         raise ValueError(
@@ -123,20 +123,20 @@ def load_run_state(parts: dict[str, Any], state: dict[str, Any]) -> None:
 
 
 def seed_epoch(env: EnvBase, seeds: Sequence[int], processes: int, trainer: Trainer) -> None:
-    """Seeds environments whose state is not in checkpoints, so that a resumed run has the same episodes."""
+    """Seeds environments whose state checkpoints cannot hold, so that resumed runs have the same episodes."""
     begins = trainer.epochs > 0 and not trainer.in_epoch
     if begins and processes == 0 and _worlds(env, processes) is None:
         goal_env(env).set_seeds([derive_seed(seed, trainer.epochs) for seed in seeds])
 
 
 def _worlds(env: EnvBase, processes: int) -> BatchedEnv | None:
-    """Returns the environment below all transforms if this process collects and its state can be saved."""
+    """Returns the environment without its transforms, if its state is saved in checkpoints; else None."""
     worlds = goal_env(env)
     return worlds if processes == 0 and isinstance(worlds, BatchedEnv) else None
 
 
 def _made_of(components: Components) -> dict[str, str]:
-    """Returns the properties of components that must be equal for a run to resume."""
+    """Returns a description of components, which must be the same when a run is resumed."""
     writer = components.buffer.writer
     hindsight: list[object] = []
     if isinstance(writer, HERWriter):

@@ -1,4 +1,4 @@
-"""Evaluates success and values of critics at virtual goals, in greedy episodes that ask for them."""
+"""Evaluates success and values of critics at virtual goals, in greedy episodes that have these goals."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from torchrl_her_recipes.components.curricula import CurriculumState
 from torchrl_her_recipes.runs.curriculum import play_greedily
 from torchrl_her_recipes.runs.evaluation import measure
 
-_TRIES = 8  # rows that are drawn for each virtual goal, since some rows are real
+_TRIES = 8  # rows that are drawn per virtual goal, several since some rows are not virtual
 _NAMES = ("success", "q", "q_bias")
 
 
 def at_virtual_goals(components: Components, epoch: int) -> dict[str, Tensor]:
-    """Measures greedy episodes of each run that have virtual goals, [R] each.
+    """Plays greedy episodes with virtual goals, and computes metrics of each run.
 
     Returns:
-        ``virtual_success``, ``virtual_q`` and ``virtual_q_bias``: the metrics ``success``, ``q`` and
-        ``q_bias`` at virtual goals; NaN for runs without virtual goals, or below the last stage.
+        ``virtual_success``, ``virtual_q`` and ``virtual_q_bias``, [R] each: the metrics ``success``, ``q``
+        and ``q_bias`` at virtual goals; NaN for runs without virtual goals of the full task.
     """
     env = components.virtual_env
     if env is None:
         return {}
     has_goals = torch.tensor(ask_for_virtual_goals(components, env, epoch))
     played = play_greedily(components, env, epoch)
-    # Success must be computed: the environment's flag ``is_success`` is about its own goals.
+    # The environment's flag ``is_success`` refers to its own goals, so success must be computed.
     measures = measure(components, played.exclude(("next", "is_success")))
     return {
         f"virtual_{name}": measures[name].masked_fill(~has_goals, torch.nan)
@@ -41,11 +41,11 @@ def at_virtual_goals(components: Components, epoch: int) -> dict[str, Tensor]:
 
 
 def ask_for_virtual_goals(components: Components, env: EnvBase, epoch: int) -> list[bool]:
-    """Sets virtual goals for the next episodes, drawn for each run from its rows in the buffer.
+    """Draws virtual goals from the rows of each run in the buffer, and sets them for the next episodes.
 
     Returns:
-        For each run, whether it has virtual goals of the full task. If not, its episodes ask for the
-        task's own.
+        For each run, whether it has virtual goals of the full task. If not, its episodes have the task's own
+        goals.
     """
     asking, has_goals = _asking(env), []
     widths = (env.observation_spec[key].shape[-1] for key in ("desired_goal", "observation"))
@@ -67,7 +67,7 @@ def ask_for_virtual_goals(components: Components, env: EnvBase, epoch: int) -> l
 def _virtual_goals(
     buffer: TensorDictReplayBuffer, state: CurriculumState | None, run: int, number: int, seed: int
 ) -> Tensor:
-    """Draws up to ``number`` virtual goals [n, g] of the full task from a run's rows."""
+    """Returns up to ``number`` virtual goals [n, g] of the full task, drawn from a run's rows; or none."""
     begin, end = bounds_of_run(buffer, run)
     if begin == end or (state is not None and not state.at_the_top(run)):
         return torch.empty(0, 1)

@@ -1,1 +1,1 @@
-"""Studies: many runs that are compared."""
+"""Runs studies and sweeps: plans their jobs, trains them on workers, and draws their figures."""

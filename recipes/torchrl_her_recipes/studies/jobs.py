@@ -1,4 +1,4 @@
-"""Jobs of a study. A job trains runs side by side into a folder, on this machine or another."""
+"""Jobs of a study: a job trains several runs side by side, on this machine or another, into a folder."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from torchrl_her_recipes.runs.folder import RunFolder
 from torchrl_her_recipes.runs.run import RunResult, resume, run
 
 _CHECKPOINTS = "checkpoint*.pt"
-_ORPHAN = 300.0  # seconds that a worker whose study was killed has to save its run
+_ORPHAN = 300.0  # seconds to wait until an earlier worker, whose study was killed, has saved its run
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,8 +29,8 @@ class Job:
         label: name of the job within the study.
         recipe: recipe of the runs.
         folder: folder of the runs.
-        around: context manager around the job in its process, as ``module:name``, which yields callbacks;
-            empty for no context manager.
+        around: context manager, as ``module:name``, in which the job is run in its process, and which yields
+            callbacks for the run; empty for none.
         options: arguments of the context manager, plain values by name.
     """
 
@@ -41,9 +41,9 @@ class Job:
     options: dict[str, Any] = field(default_factory=dict)
 
     def to_plain(self) -> dict[str, Any]:
-        """Converts the job to plain values for another process, with the modules that it must import first.
+        """Converts the job to plain values for another process.
 
-        These modules register the tasks and learners that the recipe may name.
+        They include the names of modules to import first, which may register tasks and learners.
         """
         recipe, modules = self.recipe.to_dict(), imported_modules()
         plain = {"label": self.label, "recipe": recipe, "folder": str(self.folder), "modules": modules}
@@ -54,17 +54,17 @@ class Job:
         """Makes a job from the values of :meth:`to_plain`, and imports its modules.
 
         Raises:
-            ValueError: a module cannot be imported here, or the recipe names something that is not known.
+            ValueError: a module cannot be imported, or the recipe names a task or a choice that is unknown.
         """
         import_modules(values["modules"])
         recipe = Recipe.from_dict(values["recipe"])
-        permit_task(recipe.task.name)  # was checked in the process that started the study
+        permit_task(recipe.task.name)  # the process that started the study has checked the permission
         around = {name: values[name] for name in ("around", "options")}
         return cls(label=values["label"], recipe=recipe, folder=Path(values["folder"]), **around)
 
 
 class Progress(NamedTuple):
-    """Progress of a run: epochs, and the seconds that they took."""
+    """Progress of a run: number of finished epochs, and the seconds that they took."""
 
     epochs: int = 0
     seconds: float = 0.0
@@ -75,9 +75,9 @@ class Outcome:
     """Outcome of a job.
 
     Attributes:
-        interrupted: whether the job was stopped; it can be resumed.
+        interrupted: whether the job was stopped on request, so that it can be resumed.
         error: reason of a failure, in one line; empty if the job did not fail.
-        died: whether the process of the job ended without an outcome.
+        died: whether the job failed because its process ended.
     """
 
     interrupted: bool = False
@@ -86,13 +86,13 @@ class Outcome:
 
 
 def can_resume(folder: Path) -> bool:
-    """Returns whether a folder has a checkpoint to resume from."""
+    """Returns whether a folder has a run with a checkpoint from which it can be resumed."""
     home = RunFolder(folder)
     return home.config.exists() and bool(home.checkpoints)
 
 
 def read_progress(folder: Path) -> Progress:
-    """Reads the progress of a run from the last line of its table, without reading the rest.
+    """Reads the progress of a run from the last line of its table of metrics; 0 epochs without a table.
 
     Example:
         >>> read_progress(Path("nowhere"))
@@ -102,16 +102,16 @@ def read_progress(folder: Path) -> Progress:
         lines = read_text(RunFolder(folder).metrics, largest=LARGEST_TABLE).splitlines()
     except (OSError, ValueError):  # the table is missing or damaged
         return Progress()
-    with suppress(IndexError, ValueError, KeyError):  # a power failure can cut the last line
+    with suppress(IndexError, ValueError, KeyError):  # after a power failure, the last line may be cut off
         last = dict(zip(lines[0].split(","), lines[-1].split(","), strict=True))
         return Progress(int(last["epoch"]), float(last["seconds"]))
     return Progress()
 
 
 def kept_progress(job: Job) -> Progress:
-    """Returns the progress of a job that is not running, up to its last checkpoint.
+    """Returns the progress of a job that is not running, or no progress if it cannot be resumed.
 
-    A job that was killed between its last epoch and its pictures counts as one epoch short of its end.
+    A job that was killed after its last epoch, but before its last files, counts as one epoch short.
     """
     done, home = read_progress(job.folder), RunFolder(job.folder)
     if done.epochs >= job.recipe.run.epochs and home.is_done:
@@ -121,9 +121,9 @@ def kept_progress(job: Job) -> Progress:
 
 
 def run_job(job: Job) -> Outcome:
-    """Runs a job, or resumes it from its checkpoint. Ctrl-C ends it at the next good moment.
+    """Runs a job, or resumes it from its checkpoint. After Ctrl-C, the job saves its state and ends.
 
-    Raises no errors: an error is part of the outcome, and its traceback is in ``error.txt``.
+    Errors are not raised but returned in the outcome; their traceback is written to ``error.txt``.
     """
     story = job.folder / "error.txt"
     try:
@@ -144,7 +144,7 @@ def _train(job: Job) -> RunResult:
         if can_resume(job.folder):
             return resume(job.folder, callbacks=callbacks, progress=False)
         home = RunFolder(job.folder)
-        for left in (home.config, home.metrics):  # left by a stop before the first checkpoint
+        for left in (home.config, home.metrics):  # files of a run that stopped before its first checkpoint
             left.unlink(missing_ok=True)
         return run(build(job.recipe), job.folder, callbacks=callbacks, progress=False)
 
@@ -153,11 +153,11 @@ def pack(folder: Path, *, checkpoints: bool) -> dict[str, bytes]:
     """Reads the files of a run's folder, to be sent to another machine.
 
     Args:
-        folder: folder of the run; it may not exist yet.
-        checkpoints: whether to include checkpoints. They hold replay buffers, gigabytes for many runs.
+        folder: folder of the run, which need not exist.
+        checkpoints: whether to include checkpoints, which contain replay buffers and may be gigabytes.
 
     Returns:
-        Contents by path within the folder.
+        Contents of the files, by their paths relative to the folder.
 
     Example:
         >>> import tempfile
@@ -173,9 +173,10 @@ def pack(folder: Path, *, checkpoints: bool) -> dict[str, bytes]:
 
 
 def unpack(files: dict[str, bytes], folder: Path) -> None:
-    """Writes the files from :func:`pack` into a folder, and replaces an existing one.
+    """Writes files from :func:`pack` to a folder, replacing an existing folder.
 
-    The folder never is incomplete: files are written into another one, which is then renamed.
+    The files are first written to a temporary folder, which is then renamed, so that the folder is never
+    incomplete.
     """
     part = folder.with_name(f".{folder.name}.part")
     shutil.rmtree(part, ignore_errors=True)

@@ -1,4 +1,4 @@
-"""Figures of finished runs."""
+"""Draws the virtual goals of finished runs from their files."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from torchrl_her_recipes.studies.seed_batches import Batches
 
 
 def plot_virtual_goals(folder: Path, out: Path) -> None:
-    """Draws a heat map of a run's virtual goals beside the target q*.
+    """Draws a heat map of a run's virtual goals beside a heat map of their target q*.
 
     Args:
-        folder: folder of a run, or of the batches of a study's combination.
+        folder: folder of a run, or of a combination of a study.
         out: path of the figure.
 
     Raises:
-        ValueError: a folder without a run, a run without a map of goals, or a task that names a module that
-            must not be imported.
+        ValueError: the folder has no run, the run has no map of goals, or its task names a module that must
+            not be imported.
     """
     runs = Batches(folder)
     if not runs.homes:
@@ -33,7 +33,7 @@ def plot_virtual_goals(folder: Path, out: Path) -> None:
 
 
 def _missing(runs: Batches, task: str) -> str:
-    """Returns why runs have no map of goals."""
+    """Returns the reason why runs have no map of goals, for a message."""
     rows = runs.rows()
     if not rows or not rows[-1].get("rows_virtual"):
         return "its runs have written no virtual goals"

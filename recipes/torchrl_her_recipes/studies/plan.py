@@ -1,4 +1,4 @@
-"""Unfinished jobs of a study, and an estimate of their time from the epochs so far."""
+"""The class :class:`Plan`: the unfinished jobs of a study, with an estimate of the time that they need."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.runs.folder import RunFolder
 from torchrl_her_recipes.studies.jobs import Job, kept_progress
 
-# Cost of a gradient step besides its matrix products, in their unit: rows times weights.
+# Cost of a gradient step in addition to its matrix products; the unit of both is rows times weights.
 _OVERHEAD = 1e7
 
 
 def relative_cost(recipe: Recipe, epochs: int) -> float:
-    """Estimates the relative cost of some epochs of a batched run: gradient steps, weighted by their size.
+    """Estimates the cost of ``epochs`` epochs of a job, in an arbitrary unit, from its gradient steps.
 
     Example:
         >>> from torchrl_her_recipes import load_preset, make_recipe
@@ -29,7 +29,7 @@ def relative_cost(recipe: Recipe, epochs: int) -> float:
 
 
 def wall_clock(seconds: Iterable[float], at_once: int) -> float:
-    """Computes the seconds until all jobs are done, if a job starts whenever a worker is free.
+    """Computes the seconds until all jobs are done, if each starts as soon as one of the workers is free.
 
     Example:
         >>> wall_clock([3.0, 2.0, 2.0], at_once=2)
@@ -42,7 +42,7 @@ def wall_clock(seconds: Iterable[float], at_once: int) -> float:
 
 
 def duration(seconds: float) -> str:
-    """Formats a number of seconds for readers.
+    """Formats a number of seconds as seconds, minutes or hours.
 
     Example:
         >>> duration(42), duration(8 * 60), duration(5000)
@@ -55,16 +55,16 @@ def duration(seconds: float) -> str:
 
 
 class Plan:
-    """The jobs of a study, and the progress of each.
+    """The jobs of a study, with the progress of each job.
 
     Args:
-        jobs: jobs in the order of the table.
+        jobs: the jobs, in the order in which :meth:`table` lists them.
 
     Attributes:
-        progress: epochs and seconds of each job, by label.
+        progress: finished epochs and seconds of each job, by label.
 
     Raises:
-        ValueError: the folder of a job holds a run with other options.
+        ValueError: the folder of a job already has a run with other options.
     """
 
     def __init__(self, jobs: Iterable[Job]) -> None:
@@ -80,23 +80,23 @@ class Plan:
 
     @property
     def to_go(self) -> list[Job]:
-        """Unfinished jobs, the longest first, so that cores are idle only shortly at the end."""
+        """Unfinished jobs, the longest first, so that few cores are idle toward the end of the study."""
         return sorted((job for job in self.jobs if not self.is_done(job)), key=self._cost_to_go, reverse=True)
 
     @property
     def steps(self) -> int:
-        """Environment steps of all runs together."""
+        """Number of environment steps of all runs together."""
         return sum(job.recipe.total_frames * job.recipe.run.num_runs for job in self.jobs)
 
     def steps_to_go(self, jobs: Iterable[Job]) -> int:
-        """Returns the environment steps that some jobs still have to do."""
+        """Returns the number of environment steps that the given jobs have not done yet."""
         return sum(
             self._epochs_to_go(job) * job.recipe.collection.epoch_frames * job.recipe.run.num_runs
             for job in jobs
         )
 
     def wall_clock(self, jobs: Iterable[Job], at_once: int) -> float:
-        """Estimates the seconds until some jobs are done; NaN until an epoch of the study is done."""
+        """Estimates the seconds until the given jobs are done; NaN if no epoch of the study is done yet."""
         costs = {job.label: relative_cost(job.recipe, self.progress[job.label].epochs) for job in self.jobs}
         if not any(costs.values()):
             return math.nan
@@ -104,7 +104,7 @@ class Plan:
         return pace * wall_clock(map(self._cost_to_go, jobs), at_once)
 
     def table(self, at_once: int) -> list[str]:
-        """Formats a line for each job, with its state and remaining time, and one for all jobs."""
+        """Formats a line for each job, with its state and remaining time, and a line for all jobs."""
         width = max(len(job.label) for job in self.jobs)
         lines = [f"  {job.label:<{width}}  {self._state(job)}" for job in self.jobs]
         if to_go := self.to_go:
@@ -112,7 +112,7 @@ class Plan:
         return lines
 
     def about(self, jobs: Iterable[Job], at_once: int, text: str) -> str:
-        """Replaces ``{}`` in a text by the time until jobs are done; empty if the time is not known yet."""
+        """Inserts the time until jobs are done for ``{}`` in a text; returns "" if it cannot be estimated."""
         seconds = self.wall_clock(jobs, at_once)
         return "" if math.isnan(seconds) else text.format(f"about {duration(seconds)}")
 
@@ -131,7 +131,7 @@ class Plan:
 
 
 def _begun(job: Job) -> Recipe:
-    """Returns the recipe in a job's folder, or the job's recipe if the file is missing or damaged."""
+    """Returns the recipe of the run in a job's folder; the job's own recipe if there is no readable run."""
     try:
         return RunFolder(job.folder).recipe()
     except ValueError:

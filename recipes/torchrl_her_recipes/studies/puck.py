@@ -1,4 +1,4 @@
-"""A puck with momentum whose episodes do not end at the goal: tests whether an agent stays there."""
+"""A task for studies: a puck with momentum must stop at its goal, since episodes do not end there."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-_FORCE = 0.02  # velocity gained in a step, in half tables per step
-_NEAR = 0.1  # distance from the goal, in half tables, below which it is achieved
+_FORCE = 0.02  # largest change of velocity in a step; the unit of length is half the table's width
+_NEAR = 0.1  # distance below which the goal is achieved, in the same unit
 
 
 class Puck(EnvBase):
-    """N pucks without friction, each pushed by a force on a table whose cushions stop it.
+    """N environments in which an action pushes a puck over a table without friction; the edges stop the puck.
 
-    An episode has 50 steps and begins at rest. Starts and goals are uniform on the table [-1, 1]². Nothing
-    ends an episode early: a puck that arrives too fast slides past its goal.
+    An episode has 50 steps and begins at rest. Starts and goals are uniform on the table [-1, 1]². Episodes
+    do not end at the goal, so a puck that arrives too fast slides past it.
 
     Args:
-        num_envs: Number of environments, N.
-        seed: Seed of all starts and goals; R seeds for R equal blocks of environments.
+        num_envs: N, the number of environments.
+        seed: Seed of all starts and goals, or R seeds for R equal blocks of environments.
 
     Example:
         >>> env = Puck(num_envs=2, seed=0)
@@ -51,12 +51,12 @@ class Puck(EnvBase):
         self.set_seeds([seed] if isinstance(seed, int) else seed)
 
     def compute_reward(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
-        """Returns rewards [..., 1]: 0 if two goals [..., 2] are near each other, else -1."""
+        """Returns rewards [..., 1]: 0 if the goals [..., 2] are closer than 0.1, else -1."""
         near = (achieved_goal - desired_goal).norm(dim=-1, keepdim=True) < _NEAR
         return near.float() - 1.0
 
     def set_seeds(self, seeds: Sequence[int]) -> None:
-        """Seeds R equal blocks of environments; what a block draws does not depend on other blocks."""
+        """Seeds R equal blocks of environments, each with a random generator of its own."""
         self._generators = [torch.Generator().manual_seed(seed) for seed in seeds]
 
     def _set_seed(self, seed: int | None) -> None:
@@ -69,7 +69,7 @@ class Puck(EnvBase):
         drawn = torch.zeros(len(begins), 4)
         for block, generator in enumerate(self._generators):
             rows = slice(block * count, (block + 1) * count)
-            if begins[rows].any():  # no block depends on the others
+            if begins[rows].any():  # blocks draw only for their own resets, so they are independent
                 drawn[rows].uniform_(-1.0, 1.0, generator=generator)
         self.place = torch.where(begins, drawn[:, :2], self.place)
         self.goal = torch.where(begins, drawn[:, 2:], self.goal)

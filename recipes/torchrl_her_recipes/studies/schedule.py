@@ -1,4 +1,4 @@
-"""Runs the jobs of a plan side by side on the available workers, and shows their progress."""
+"""Runs the unfinished jobs of a plan on workers, several at once, and shows their progress."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from torchrl_her_recipes.studies.jobs import Job, Outcome, kept_progress
 from torchrl_her_recipes.studies.plan import Plan
 from torchrl_her_recipes.studies.workers import Workers
 
-_TICK = 1.0  # seconds between two updates of the progress
+_TICK = 1.0  # seconds between two updates of the displayed progress
 _BAR = "{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} steps [{elapsed}{postfix}]"
 _STOPPING = "{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} steps [saving what there is]"
-_PART = 0.05  # fraction of all steps after which a line is printed, if there is no terminal
+_PART = 0.05  # fraction of all steps after which another line is printed, if there is no terminal
 
 
 def run_jobs(plan: Plan, workers: Workers, *, progress: bool = True) -> dict[str, Outcome]:
     """Runs all unfinished jobs of a plan.
 
-    If a job fails, the others are still run. The first Ctrl-C stops all jobs after they have saved their
-    state; the second one ends them at once.
+    If a job fails, the other jobs continue. After a first Ctrl-C, all jobs save their state and stop; a
+    second Ctrl-C ends them at once.
 
     Returns:
         The outcome of each job, by label.
@@ -60,13 +60,13 @@ def run_jobs(plan: Plan, workers: Workers, *, progress: bool = True) -> dict[str
 
 
 def outcome_of(future: Future[Outcome]) -> Outcome:
-    """Returns the outcome of a job, even if the worker itself has failed."""
+    """Returns the outcome of a job; an error of the worker itself becomes an outcome that has failed."""
     error = future.exception()
     return future.result() if error is None else Outcome(error=" ".join(f"{error!r}".split()))
 
 
 class _Overview:
-    """Progress of the jobs on the standard error stream: a bar on a terminal, a few lines elsewhere."""
+    """Shows the progress of jobs on the standard error stream: as a bar on a terminal, else as some lines."""
 
     def __init__(self, plan: Plan, workers: Workers, *, show: bool) -> None:
         self.plan, self.workers = plan, workers
@@ -76,7 +76,7 @@ class _Overview:
         self._next = self._share() + _PART
 
     def show(self, left: Sequence[Job]) -> None:
-        """Updates plan and bar."""
+        """Reads the progress of running jobs and updates the bar; ``left`` are the unfinished jobs."""
         working = self.workers.progress()
         self.plan.progress.update(working)
         self.bar.n = self.plan.steps - self.plan.steps_to_go(self.plan.jobs)
@@ -89,12 +89,12 @@ class _Overview:
             self._say(f"{share:.0%} of all steps: {state}")
 
     def ended(self, job: Job, outcome: Outcome) -> None:
-        """Reports that a job has ended, and its outcome."""
+        """Prints a line with the outcome of a job that has ended, if there is no terminal."""
         how = "failed" if outcome.error else "interrupted" if outcome.interrupted else "done"
         self._say(f"{job.label}: {how}")
 
     def stopping(self) -> None:
-        """Reports that all jobs are stopping."""
+        """Shows that all jobs are saving their state to stop."""
         self.bar.bar_format = _STOPPING
         self._say("saving what there is")
 

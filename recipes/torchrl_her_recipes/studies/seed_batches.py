@@ -1,4 +1,4 @@
-"""Batches of seeds of one combination of a study; the seeds of a batch are trained side by side."""
+"""Divides the seeds of a study's combination into batches, trained side by side, and reads their results."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from torchrl_her_recipes.runs.folder import RunFolder
 from torchrl_her_recipes.runs.goal_map import GoalMap
 from torchrl_her_recipes.studies.jobs import Job, read_progress
 
-_ROWS = 1_280  # rows of a batch's gradient step above which more runs side by side are no faster
+_ROWS = 1_280  # rows in a gradient step of all runs together, above which further runs save no time
 
 
 class Batches:
-    """The batches of runs of one combination of a study, a folder ``seeds_*`` each, or a single run's folder.
+    """Results of a combination's runs, which are in folders ``seeds_*``, one for each batch of seeds.
 
-    Finished batches are read. While none is finished, the unfinished ones are, up to the last epoch that all
-    of them have reached.
+    Only finished batches are read. If no batch is finished, unfinished batches are read, up to the last epoch
+    that all of them have reached.
 
     Args:
-        paths: folders; several if each holds some of the seeds. They may not exist yet.
+        paths: folders that contain such folders, or folders of single runs; they need not exist.
 
     Attributes:
-        homes: the batches that were begun, in the order of their seeds.
+        homes: folders of the batches that were begun, in the order of their seeds.
     """
 
     def __init__(self, *paths: Path) -> None:
@@ -47,7 +47,7 @@ class Batches:
 
     @cached_property
     def shown(self) -> list[RunFolder]:
-        """Folders that are read: finished ones, or those with results if none is finished."""
+        """Folders that are read: finished batches or, if there are none, all batches with results."""
         return self._done or [home for home in self.homes if home.rows()]
 
     @property
@@ -57,7 +57,7 @@ class Batches:
 
     @property
     def recipe(self) -> Recipe | None:
-        """The recipe of all seeds together; None if there is nothing to read.
+        """The recipe of all runs in the folders that are read, as one recipe; None if there are none.
 
         Raises:
             ValueError: a configuration cannot be read.
@@ -67,11 +67,11 @@ class Batches:
 
     @property
     def seconds(self) -> float:
-        """Seconds that the runs took, with one core for each batch, without their pictures."""
+        """Total seconds of training of all batches, each on one core."""
         return sum(read_progress(home.path).seconds for home in self.shown)
 
     def rows(self) -> list[dict[str, float]]:
-        """Joins the tables of the runs: rows by epoch and run; runs are renumbered."""
+        """Joins the tables of metrics, sorted by epoch and run; runs are numbered by their seeds."""
         tables = [home.rows() for home in self.shown]
         if not tables:
             return []
@@ -86,13 +86,13 @@ class Batches:
         return sorted(rows, key=lambda row: (row["epoch"], row["run"]))
 
     def goal_map(self) -> GoalMap | None:
-        """Reads the map of the runs' virtual goals; None if no run has written one."""
+        """Reads the maps of virtual goals of all runs as one map; None if no run has written one."""
         maps = [GoalMap.load(home.goal_map) for home in self.shown if home.goal_map.is_file()]
         return GoalMap(np.concatenate([part.counts for part in maps]), maps[0].target) if maps else None
 
 
 def plan_batches(label: str, recipe: Recipe, folder: Path) -> list[Job]:
-    """Plans the jobs of one combination: existing batches, and batches of missing seeds."""
+    """Plans the jobs of one combination: one for each existing batch, and new batches for missing seeds."""
     home = folder / label
     if (home / "config.yaml").exists():
         raise ValueError(f"{home} is the folder of a single run; choose another folder for the study")
@@ -118,16 +118,16 @@ def _seeds_of(path: Path) -> list[int]:
     """Returns the seeds of a batch, from the name of its folder."""
     match = re.fullmatch(r"seeds_(\d+)(?:-(\d+))?", path.name)
     if match is None:
-        raise ValueError(f"{path} is not the name of a batch, which is for instance seeds_0-4")
+        raise ValueError(f"{path} must have the name of a batch, such as seeds_0-4")
     return list(range(int(match[1]), int(match[2] or match[1]) + 1))
 
 
 def share_out(seeds: Sequence[int], *, most: int) -> list[list[int]]:
-    """Divides neighboring seeds into batches, as few and as equal as possible.
+    """Divides seeds into batches of consecutive seeds, as few and of as equal sizes as possible.
 
     Args:
-        seeds: in rising order, possibly with gaps.
-        most: maximum number of seeds in a batch.
+        seeds: seeds in rising order, possibly with gaps.
+        most: largest number of seeds in a batch.
 
     Example:
         >>> share_out([0, 1, 2, 3, 4, 5, 9], most=5)

@@ -1,4 +1,4 @@
-"""Runs the unfinished runs of a study or sweep, on all cores or a cluster."""
+"""Runs the unfinished jobs of a study or a sweep, on all cores or a cluster, and draws a study's figure."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ from torchrl_her_recipes.studies.schedule import run_jobs
 from torchrl_her_recipes.studies.seed_batches import Batches, plan_batches
 from torchrl_her_recipes.studies.workers import LocalWorkers, Workers
 
-_NOTE = "sweep.json"  # file that lists the single runs of a folder
+_NOTE = "sweep.json"  # file with the recipes of all runs of a sweep, by which the sweep is recognized
 
 
 @dataclass(frozen=True, kw_only=True)
 class StudyResult:
-    """The result of a study, or of single runs.
+    """The result of a study or of a sweep.
 
     Attributes:
-        figure: the picture of a study, if all its runs are done.
-        successes: success of each run in its last evaluation, by the name of its combination or single run.
+        figure: path of a study's figure; None if runs are unfinished, and for a sweep.
+        successes: success of each run in its last evaluation, by the name of its combination or of the run.
             Combinations with unfinished runs are left out.
-        failed: reasons of failures, by the label of the job. Other jobs are run nevertheless.
-        interrupted: whether the study was stopped; it can be resumed.
+        failed: reasons of failures, by the label of the job.
+        interrupted: whether the user stopped the study, which can be resumed.
     """
 
     figure: Path | None = None
@@ -46,15 +46,15 @@ class StudyResult:
 
 
 def plan_study(study: Study | Mapping[str, Recipe], folder: Path) -> Plan:
-    """Plans the jobs of a study, and estimates their time.
+    """Plans the jobs of a study or of a sweep.
 
     Args:
-        study: study to run; or recipes of single runs, by the names of their folders.
-        folder: folder with a folder for each combination or single run, which may exist already. If an
-            existing combination lacks seeds of the study, jobs are planned for these seeds.
+        study: study to run; or recipes of a sweep's runs, by the names of their folders.
+        folder: folder with a folder for each combination or run, which may exist already. If an existing
+            combination lacks seeds of the study, jobs are planned for these seeds.
 
     Raises:
-        ValueError: the folder has a run of other options under the same name.
+        ValueError: the folder has a run with the same name and other options.
     """
     if isinstance(study, Study):
         cells = ((label, resolved(recipe)) for label, recipe in study.cells())
@@ -71,19 +71,19 @@ def run_study(
     workers: Workers | None = None,
     progress: bool = True,
 ) -> StudyResult:
-    """Runs the unfinished jobs of a study, several at once, and draws its figure.
+    """Runs the unfinished jobs of a study or of a sweep, several at once, and draws a study's figure.
 
     Interrupted runs are resumed from their checkpoints.
 
     Args:
-        study: study to run; or recipes of single runs, by the names of their folders.
-        folder: folder in which each combination or single run gets a folder.
-        workers: workers that run the jobs, by default a process for each core; closed at the end.
-        progress: whether to show a progress bar for the whole study.
+        study: study to run; or recipes of a sweep's runs, by the names of their folders.
+        folder: folder in which each combination or run gets a folder.
+        workers: workers that run the jobs, by default a process for each core; they are closed at the end.
+        progress: whether to show a progress bar for all jobs together.
 
     Raises:
-        ValueError: the folder has a run of other options under the same name, another process is using it, or
-            a task names a module that must not be imported.
+        ValueError: the folder has a run with the same name and other options, another process is using the
+            folder, or a task names a module that must not be imported.
         KeyboardInterrupt: Ctrl-C was pressed a second time.
     """
     runs = dict(study.cells()) if isinstance(study, Study) else study
@@ -114,8 +114,8 @@ def unfinished_sweep(runs: Mapping[str, Recipe], folders: Path) -> Path | None:
     """Finds the newest folder of an unfinished sweep with exactly the given runs; None if there is none.
 
     Args:
-        runs: recipes, by the names of their folders.
-        folders: folder in which to search for folders of :func:`run_study`.
+        runs: recipes of the runs, by the names of their folders.
+        folders: folder that contains the folders of sweeps.
 
     Example:
         >>> unfinished_sweep({}, Path("nowhere"))
@@ -132,7 +132,7 @@ def _note(runs: Mapping[str, Recipe]) -> str:
 
 
 def draw_study(study: Study, folder: Path) -> Path:
-    """Draws metrics over environment steps: a panel for each task, a curve for each combination on it."""
+    """Draws a study's metrics over environment steps, a panel for each task; returns the figure's path."""
     path = folder / f"{study.name}.png"
     panels: dict[str, dict[str, list[dict[str, float]]]] = {}
     for label, recipe in study.cells():

@@ -1,4 +1,4 @@
-"""A task whose lengths are multiplied by a factor, to test whether an agent depends on their unit."""
+"""Tasks for studies whose lengths are multiplied by a factor, to test if training depends on their unit."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ _LENGTHS = ("observation", "achieved_goal", "desired_goal")
 
 
 class InUnits(GoalEnv):
-    """Environments with goals whose observations and goals are multiplied by a factor; actions are not.
+    """Wrapper that multiplies observations and goals of environments by a factor, but not actions.
 
     Args:
         env: environments from :func:`~torchrl_her_envs.make_env`.
-        factor: factor of observations and goals, and of the distance below which a goal is achieved.
+        factor: the factor, which also scales the distance below which a goal is achieved.
     """
 
     def __init__(self, env: EnvBase, factor: float) -> None:
@@ -46,11 +46,11 @@ class InUnits(GoalEnv):
         return self.task.batched
 
     def compute_reward(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
-        """Computes the reward of the task: maps goals [..., g] to [..., 1]."""
+        """Computes the task's rewards [..., 1] from multiplied goals [..., g]."""
         return self.task.compute_reward(achieved_goal / self.factor, desired_goal / self.factor)
 
     def compute_terminated(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
-        """Returns whether an episode of the task ends: maps goals [..., g] to [..., 1]."""
+        """Computes whether the task terminates an episode, [..., 1], from multiplied goals [..., g]."""
         return self.task.compute_terminated(achieved_goal / self.factor, desired_goal / self.factor)
 
     def set_seeds(self, seeds: Any) -> None:
@@ -73,7 +73,7 @@ class InUnits(GoalEnv):
 def in_units(
     task: str, factor: float, *, num_envs: int = 1, seed: Any = 0, dtype: torch.dtype = torch.float32
 ) -> InUnits:
-    """Makes environments of a task in other units.
+    """Makes environments of a task whose observations and goals are multiplied by ``factor``.
 
     Example:
         >>> env = in_units("hand_v1", 1_000.0, num_envs=2)

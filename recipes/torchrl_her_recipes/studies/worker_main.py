@@ -1,7 +1,7 @@
-"""Worker process: runs the jobs from its standard input, one after the other, until the input ends.
+"""Program of a worker process: runs the jobs that it reads from its standard input, one after the other.
 
-If the input ends in the middle of a job, the process saves the run and ends. So it also stops if the
-process that started it is gone.
+If the input ends during a job, the process saves the run and ends. So it also stops if the process that
+started it was killed.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from torchrl_her_recipes.studies.jobs import Job, Outcome, run_job
 
 
 def main() -> None:
-    """Runs the process."""
+    """Runs jobs from the standard input, and writes their outcomes to the standard output."""
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     logging.getLogger("torch.utils.cpp_extension").setLevel(logging.ERROR)
     try:
         with os.fdopen(os.dup(sys.stdout.fileno()), "wb") as answers:
-            os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # keeps other output out of the outcomes
+            os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # prints must not mix with pickled outcomes
             _serve(answers)
     except BrokenPipeError:
-        pass  # the process that started this one is gone
+        pass  # the process that started this one has ended, so nothing reads the outcomes
 
 
 def _serve(answers: BinaryIO) -> None:
@@ -37,8 +37,8 @@ def _serve(answers: BinaryIO) -> None:
     working = False
 
     def stop(_number: int, _frame: FrameType | None) -> None:
-        # Between jobs there is nothing to stop, and an error in the garbage collection or at exit would only
-        # prevent the release of semaphores.
+        # Between jobs there is nothing to stop, and an error in garbage collection or at exit would keep
+        # semaphores from being released.
         if working:
             raise KeyboardInterrupt
 
@@ -49,18 +49,18 @@ def _serve(answers: BinaryIO) -> None:
             working = True
             outcome = _run(values)
             working = False
-        except KeyboardInterrupt:  # a stop before the job began, or just after it ended
+        except KeyboardInterrupt:  # a signal just before the job began or just after it ended
             working = False
             outcome = Outcome(interrupted=True)
         pickle.dump(outcome, answers)
         answers.flush()
-        gc.collect()  # the buffers of a run are gigabytes, and its components refer to each other
+        gc.collect()  # frees the buffers of the run, gigabytes that are part of reference cycles
 
 
 def _run(values: dict[str, Any]) -> Outcome:
     try:
         job = Job.from_plain(values)
-    except Exception as error:  # a user's module may raise any error
+    except Exception as error:  # modules of users may raise errors of any type when they are imported
         return Outcome(error=" ".join(f"{type(error).__name__}: {error}".split()))
     return run_job(job)
 
@@ -70,7 +70,7 @@ def _listen(jobs: SimpleQueue[dict[str, Any] | None]) -> None:
         while True:
             jobs.put(pickle.load(sys.stdin.buffer))
     except (EOFError, pickle.UnpicklingError):
-        os.kill(os.getpid(), signal.SIGINT)  # a run stops at a good moment by itself
+        os.kill(os.getpid(), signal.SIGINT)  # after this signal, a running job saves its state and stops
         jobs.put(None)
 
 

@@ -1,4 +1,4 @@
-"""Workers on this machine for the jobs of a study, and the interface of any workers."""
+"""Workers that run the jobs of a study: their interface, and worker processes on this machine."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ _ON_RAY = "torchrl_her_recipes.studies.workers_ray:RayWorkers"
 
 
 class Workers(Protocol):
-    """Interface of workers, as :func:`torchrl_her_recipes.studies.schedule.run_jobs` uses them."""
+    """Interface of workers that :func:`torchrl_her_recipes.studies.schedule.run_jobs` needs."""
 
     @property
     def at_once(self) -> int:
-        """Number of jobs that run at the same time."""
+        """Largest number of jobs that run at the same time."""
 
     def run(self, job: Job) -> Outcome:
-        """Waits for a free worker, runs the job there, and returns when it has ended.
+        """Waits for a free worker, runs the job there, and returns its outcome when it has ended.
 
-        Called from threads. Two jobs must not run in one process at the same time, since threads share
+        Several threads call this method at once. They must not run jobs in one process, since threads share
         TorchRL's exploration type and torch's random numbers.
         """
 
@@ -37,16 +37,17 @@ class Workers(Protocol):
         """Returns the progress of running jobs, by label."""
 
     def stop(self) -> None:
-        """Makes all jobs save their state and stop; returns at once."""
+        """Makes all jobs save their state and stop, without waiting for them."""
 
     def close(self) -> None:
         """Kills running jobs and releases all resources."""
 
 
 class LocalWorkers:
-    """Worker processes on this machine, each of which does one job at a time; see :class:`Workers`.
+    """Worker processes on this machine, each of which runs one job at a time; see :class:`Workers`.
 
-    Each process is in its own session, so that Ctrl-C never interrupts it: :meth:`stop` lets it save first.
+    Each process has its own session, so that Ctrl-C in the terminal does not reach it. Instead, :meth:`stop`
+    makes its job save its state first.
 
     Args:
         at_once: number of processes; by default one for each core.
@@ -56,7 +57,7 @@ class LocalWorkers:
         if at_once is not None and at_once < 1:
             raise ValueError(f"jobs must be at least 1, got {at_once}")
         self.at_once = at_once or _cores()
-        self._places: LifoQueue[_Worker | None] = LifoQueue()  # free places, with an idle process or None
+        self._places: LifoQueue[_Worker | None] = LifoQueue()  # for each free slot, an idle process or None
         for _ in range(self.at_once):
             self._places.put(None)
         self._busy: dict[str, tuple[Job, _Worker]] = {}
@@ -68,7 +69,7 @@ class LocalWorkers:
             if self._stopped:
                 return Outcome(interrupted=True)
             worker = worker or _Worker()
-            self._busy[job.label] = job, worker  # from here on, stop() stops the job
+            self._busy[job.label] = job, worker  # from here on, stop() reaches the job
             if self._stopped:
                 worker.stop()
             outcome = worker.run(job)
@@ -96,23 +97,23 @@ class LocalWorkers:
             for place in places:
                 if place is not None:
                     place.end()
-        finally:  # after Ctrl-C, too, since close() may be called again
+        finally:  # even after Ctrl-C, since close() may be called again and waits for all slots
             for _ in places:
                 self._places.put(None)
 
 
 def _cores() -> int:
-    """Returns the number of cores that this process may use, which taskset or job schedulers limit."""
+    """Returns the number of cores that this process may use, which taskset or a job scheduler can limit."""
     if sys.platform == "linux":
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
 class _Worker:
-    """A worker process, seen from outside; see :mod:`torchrl_her_recipes.studies.worker_main`."""
+    """Starts and controls one process that runs :mod:`torchrl_her_recipes.studies.worker_main`."""
 
     def __init__(self) -> None:
-        environment = {"OMP_NUM_THREADS": "1", **os.environ}  # one thread: each has one core
+        environment = {"OMP_NUM_THREADS": "1", **os.environ}  # one thread, since each process has one core
         self._process = subprocess.Popen(
             _COMMAND, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment, start_new_session=True
         )
@@ -137,28 +138,28 @@ class _Worker:
         self._process.kill()
 
     def end(self) -> str:
-        """Waits for the end of the process, and returns its cause."""
+        """Waits until the process has ended, and describes how it ended."""
         self.stop()
         code = self._process.wait()
         self._answers.close()
         self.ended = True
         if code >= 0:
             return f"its process ended with code {code}"
-        hint = ", perhaps for want of memory" if code == -signal.SIGKILL else ""
+        hint = ", perhaps because memory ran out" if code == -signal.SIGKILL else ""
         return f"its process was ended by {signal.Signals(-code).name}{hint}"
 
 
 def make_workers(*, jobs: int | None = None, ray: str | None = None, gpus_per_job: float = 0.0) -> Workers:
-    """Makes worker processes on this machine, or uses the nodes of a Ray cluster.
+    """Makes workers: processes on this machine, or the nodes of a Ray cluster.
 
     Args:
-        jobs: number of jobs at once on this machine; None for one on each core.
-        ray: address of a cluster, ``auto`` or ``HOST:PORT``; None for this machine.
-        gpus_per_job: the share of a GPU that each job gets on a cluster.
+        jobs: number of jobs that run at once on this machine; None for the number of cores.
+        ray: address of a Ray cluster, ``auto`` or ``HOST:PORT``; None for this machine.
+        gpus_per_job: number of GPUs for each job on a cluster, such as 0.25.
 
     Raises:
-        ImportError: Ray is not installed.
-        ValueError: no node of the cluster has this share of a GPU.
+        ImportError: ``ray`` is given, but Ray is not installed.
+        ValueError: no node of the cluster has this number of GPUs.
         ConnectionError: there is no cluster at the address.
     """
     if ray is None:

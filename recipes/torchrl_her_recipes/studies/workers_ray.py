@@ -1,7 +1,7 @@
-"""Workers on the nodes of a Ray cluster for the jobs of a study. Needs the extra `cluster`.
+"""Runs the jobs of a study on the nodes of a Ray cluster. Needs the extra `cluster`.
 
-Nodes need only this package, and no shared disk. A job runs in a temporary folder on a node with a free
-core, and its files are sent to this machine when it ends.
+A job runs in a temporary folder on a node with a free core; when it ends, its files are sent to this machine.
+Nodes need this package, but no shared disk.
 """
 
 from __future__ import annotations
@@ -31,22 +31,22 @@ from torchrl_her_recipes.studies.jobs import (
     unpack,
 )
 
-_RETRIES = 3  # retries of a job whose node died
-_REPORT = 0.5  # seconds between two reports of a run's progress
+_RETRIES = 3  # number of times that Ray runs a job again if its node or process died
+_REPORT = 0.5  # seconds between two reports of a job's progress
 
 
 class RayWorkers:
-    """The nodes of a Ray cluster, one job for each core.
+    """Workers on the nodes of a Ray cluster, one for each core; see ``Workers`` in ``workers_local``.
 
-    Ray runs a job again, up to three times, if its node or process dies.
+    If the node or the process of a job dies, Ray runs the job again, up to three times.
 
     Args:
-        address: address of the cluster, HOST:PORT, or ``auto`` for the one that this machine is a node of.
-        gpus_per_job: the share of a GPU that each job gets, such as 0.25; 0 for none.
+        address: address of the cluster, HOST:PORT, or ``auto`` for the cluster of this machine.
+        gpus_per_job: number of GPUs for each job, such as 0.25; 0 for none.
 
     Raises:
         ConnectionError: there is no cluster at the address.
-        ValueError: no node of the cluster has this share of a GPU.
+        ValueError: no node of the cluster has this number of GPUs.
     """
 
     def __init__(self, address: str = "auto", *, gpus_per_job: float = 0.0) -> None:
@@ -64,12 +64,12 @@ class RayWorkers:
 
     @property
     def at_once(self) -> int:
-        """Number of jobs for which the cluster has cores and GPUs at present."""
+        """Number of jobs for which the cluster has enough cores and GPUs."""
         cores = int(resource("CPU"))
         return min(cores, self._places_on_gpus()) if self._gpus else cores
 
     def _places_on_gpus(self) -> int:
-        """Returns the number of jobs that fit on the GPUs at once."""
+        """Returns the number of jobs for which the cluster has enough GPUs."""
         if self._gpus > 1:
             return sum(int(count // self._gpus) for count in gpus())
         return sum(int(count) * int(1 / self._gpus) for count in gpus())
@@ -79,10 +79,10 @@ class RayWorkers:
             ray.shutdown()
 
     def run(self, job: Job) -> Outcome:
-        """Runs a job on a node with a free core, and fetches its files."""
+        """Runs a job on a node with a free core, and writes its files to the job's folder when it ends."""
         needs = _work.options(num_cpus=job.recipe.run.threads, num_gpus=self._gpus)
         task = needs.remote(job.to_plain(), _begun(job), self._board)
-        self._tasks[job.label] = task  # from here on, stop() cancels the job
+        self._tasks[job.label] = task  # from here on, stop() reaches the job
         if self._stopped:
             ray.cancel(task)
         try:
@@ -98,14 +98,14 @@ class RayWorkers:
     def progress(self) -> dict[str, Progress]:
         try:
             board = ray.get(self._board.read.remote())
-        except RayError:  # the node of the board is lost, which run() reports as an error
+        except RayError:  # the cluster is lost; run() reports this error
             board = {}
         return {label: board[label] for label in list(self._tasks) if label in board}
 
     def stop(self) -> None:
         self._stopped = True
         for task in list(self._tasks.values()):
-            ray.cancel(task)  # jobs that have begun get a KeyboardInterrupt, as by Ctrl-C
+            ray.cancel(task)  # raises a KeyboardInterrupt in a running job, like Ctrl-C
 
     def close(self) -> None:
         """Kills running jobs and leaves the cluster."""
@@ -118,7 +118,7 @@ class RayWorkers:
 
 
 class Board:
-    """Ray actor to which nodes report the progress of their jobs."""
+    """Ray actor that collects the progress of jobs, which nodes report to it."""
 
     def __init__(self) -> None:
         self._progress: dict[str, Progress] = {}
@@ -134,7 +134,7 @@ class Board:
 
 @ray.remote(max_retries=_RETRIES)
 def _work(values: dict[str, Any], files: dict[str, bytes], board: Any) -> tuple[Outcome, dict[str, bytes]]:
-    """Runs a job on a node, from the files of an earlier attempt if there are any."""
+    """Runs a job on a node, from the files of its unfinished run if there are any; returns its new files."""
     job = Job.from_plain(values)
     with TemporaryDirectory(prefix="torchrl-her-") as place:
         local_job = replace(job, folder=Path(place) / job.label)
@@ -147,7 +147,7 @@ def _work(values: dict[str, Any], files: dict[str, bytes], board: Any) -> tuple[
 
 @contextmanager
 def _reporting(job: Job, board: Any) -> Iterator[None]:
-    """Reports the progress of a job to the board, in the ``with`` block."""
+    """Context manager that reports the progress of a job to the board until the block ends."""
     ended = threading.Event()
 
     def report() -> None:
@@ -168,5 +168,5 @@ def _reporting(job: Job, board: Any) -> Iterator[None]:
 
 
 def _begun(job: Job) -> dict[str, bytes]:
-    """Returns the files that a job resumes from, if there are any."""
+    """Returns the files of a job's unfinished run, by path; empty if it has no checkpoint."""
     return pack(job.folder, checkpoints=True) if can_resume(job.folder) else {}

@@ -1,4 +1,4 @@
-"""Searches for good options: trials by Optuna, several at once, in a folder that resumes."""
+"""Searches for good options with Optuna: runs several trials at once, and resumes interrupted searches."""
 
 from importlib.util import find_spec
 

@@ -1,4 +1,4 @@
-"""Results of a search: a table of its trials, the best one as a preset, and Optuna's figures."""
+"""Writes the results of a search: a table of trials, the best trial as a preset, and Optuna's figures."""
 
 from __future__ import annotations
 
@@ -21,24 +21,24 @@ from torchrl_her.files.writing import write_text
 from torchrl_her_recipes.config.searches.search import Search
 from torchrl_her_recipes.runs.plots import save_figure
 
-_FEWEST = 5  # least number of complete trials for estimates of importance
-_SHOWN = 5  # number of trials in the printed table
-# Attribute of the trial of the unchanged recipe: its values, some of which may be outside of the space.
+_FEWEST = 5  # least number of complete trials from which importance is estimated
+_SHOWN = 5  # largest number of trials in the printed summary
+# Attribute of the trial with the unchanged recipe: the recipe's values, also those outside of the space.
 DEFAULT = "default"
 
 
 def folder_of(trial: FrozenTrial | Trial) -> str:
-    """Returns the name of a trial's folder, or of the trial that it repeats."""
+    """Returns the name of a trial's folder; a trial that repeats another one uses the other's folder."""
     return str(trial.user_attrs.get("folder", f"trial_{trial.number:04}"))
 
 
 def write_results(search: Search, study: Study, trials: Sequence[FrozenTrial], folder: Path) -> None:
-    """Writes ``trials.csv``, and the best trial as the preset ``best.yaml``.
+    """Writes the table ``trials.csv``, and the options of the best trial as the preset ``best.yaml``.
 
     Args:
-        search: search that the trials belong to.
+        search: settings of the search.
         study: Optuna's study.
-        trials: all trials except interrupted ones.
+        trials: trials for the table.
         folder: folder of the search.
     """
     names = list(search.space.ranges)
@@ -64,7 +64,7 @@ def write_results(search: Search, study: Study, trials: Sequence[FrozenTrial], f
 
 
 def importances(study: Study) -> dict[str, float]:
-    """Computes each option's importance for the score (PED-ANOVA), as fractions; empty for too few trials."""
+    """Estimates each option's share of the variation of scores (PED-ANOVA); empty for too few trials."""
     done = _in_space(study)
     if len(done.trials) < _FEWEST or len({trial.value for trial in done.trials}) < 2:
         return {}
@@ -72,7 +72,7 @@ def importances(study: Study) -> dict[str, float]:
 
 
 def _in_space(study: Study) -> Study:
-    """Returns a study of the complete trials that have all options; the first trial may lack some."""
+    """Returns a study with the complete trials that have all options, which the first trial may not have."""
     done = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
     most = max((len(trial.params) for trial in done), default=0)
     inside = create_study(direction="maximize")
@@ -84,8 +84,8 @@ def write_pictures(study: Study, folder: Path) -> None:
     """Draws Optuna's figures: ``history.png``, ``options.png`` and ``importance.png``."""
     if not study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)):
         return
-    with warnings.catch_warnings(), rc_context():  # Optuna chooses a style for the whole process
-        warnings.simplefilter("ignore")  # suppresses: figures are experimental, limits of axes
+    with warnings.catch_warnings(), rc_context():  # undoes the style that Optuna sets for the whole process
+        warnings.simplefilter("ignore")  # they say that figures are experimental, and concern limits of axes
         drawn = {
             "history": figures.plot_optimization_history(study, target_name="score"),
             "options": figures.plot_slice(study, target_name="score"),
@@ -97,7 +97,7 @@ def write_pictures(study: Study, folder: Path) -> None:
 
 
 def search_summary(study: Study) -> list[str]:
-    """Describes the best trials and the importance of each option, in lines of text."""
+    """Returns lines of text that list the best trials and the importance of each option."""
     done = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
     ranked = sorted(done, key=lambda trial: (-(trial.value or 0.0), trial.number))[:_SHOWN]
     lines = [

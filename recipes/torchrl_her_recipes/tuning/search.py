@@ -1,4 +1,4 @@
-"""Searches for good options with Optuna: each trial is a batched run in a worker process."""
+"""Runs the trials of a search as jobs in worker processes, and passes their scores to Optuna."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ from torchrl_her_recipes.tuning.results import DEFAULT, folder_of, write_picture
 
 _NAME, _SETTINGS, _DATABASE = "search", "search.yaml", "search.db"
 _TICK = 1.0  # seconds between two checks of running trials
-_ATTEMPTS = 3  # attempts at a trial whose process dies
-_FAILURES = 5  # failures before any success after which the search ends, since options cannot be the cause
+_ATTEMPTS = 3  # largest number of attempts at a trial whose process dies
+_FAILURES = 5  # a search ends if its first trials, this number of them, all fail: options cannot be the cause
 _ATTEMPT, _REPEATED, _PRUNED, _ERROR = "attempt", "repeated", "pruned", "error"
 
 
@@ -48,9 +48,10 @@ class SearchResult:
     """Result of a search so far.
 
     Attributes:
-        study: Optuna's study. Trials with the attribute ``repeated`` were cut short and run again.
-        folder: folder with the best trial as a preset, a table and pictures.
-        interrupted: whether the user stopped the search. The same call resumes it.
+        study: Optuna's study. Trials with the attribute ``repeated`` were interrupted; another trial with the
+            same values has resumed their run.
+        folder: folder with the best trial as a preset, a table of trials, and figures.
+        interrupted: whether the user stopped the search, which the same call resumes.
     """
 
     study: Study
@@ -59,7 +60,7 @@ class SearchResult:
 
     @property
     def trials(self) -> list[FrozenTrial]:
-        """All trials except interrupted ones."""
+        """All trials that have begun, except those that were interrupted and repeated."""
         return _counted(self.study)
 
     @property
@@ -70,7 +71,7 @@ class SearchResult:
 
     @property
     def failed(self) -> dict[int, str]:
-        """Reasons why trials failed, by the number of the trial."""
+        """Errors of the trials that failed, by the number of the trial."""
         failed = (trial for trial in self.trials if trial.state == TrialState.FAIL)
         return {trial.number: trial.user_attrs.get(_ERROR, "") for trial in failed}
 
@@ -85,26 +86,27 @@ def tune(
     say: Callable[[str], None] = lambda _line: None,
     progress: bool = True,
 ) -> SearchResult:
-    """Searches for good options, or resumes the search of a folder.
+    """Searches for good options, or resumes the search in a folder.
 
     Interrupted trials are resumed from their checkpoints.
 
     Args:
-        search: recipe, space, sampler and pruner.
+        search: settings of the search.
         folder: folder of the search.
 
     Keyword Args:
-        trials: number of trials in the folder at the end; 50 if ``minutes`` is not given either.
-        minutes: time after which no further trial begins.
-        workers: workers that run the trials, by default a process for each core; closed at the end.
-        say: called with a line for each trial that ends.
+        trials: total number of trials, including those of a resumed search; 50 if neither this nor
+            ``minutes`` is given.
+        minutes: minutes after which no further trial begins.
+        workers: workers that run the trials, by default a process for each core; they are closed at the end.
+        say: function that is called with a line of text for each trial that ends.
         progress: whether to show a progress bar.
 
     Raises:
-        ValueError: the folder holds another search, another process is searching in it, a limit is not
-            positive, or the task names a module that must not be imported.
+        ValueError: the folder has a search with other settings, another process is searching in it, a limit
+            is not positive, or the task names a module that must not be imported.
         ImportError: the sampler needs a package that is not installed.
-        OSError: the database cannot be used, for instance because the disk is full.
+        OSError: the database of trials cannot be used, for instance because the disk is full.
         KeyboardInterrupt: Ctrl-C was pressed a second time.
     """
     if trials is not None and trials < 1:
@@ -135,7 +137,7 @@ def tune(
 
 
 def _describe(search: Search, path: Path) -> None:
-    """Writes the settings of a search, or compares them with those in its folder."""
+    """Writes the settings of a new search; raises a ValueError if its folder has other settings."""
     text = yaml.safe_dump(search.to_plain(), sort_keys=False)
     if not path.exists():
         write_text(path, text)
@@ -150,7 +152,7 @@ def _describe(search: Search, path: Path) -> None:
 
 
 def _begin(search: Search, database: Path) -> Study:
-    """Opens Optuna's study: the first trial is the unchanged recipe, and interrupted trials are repeated."""
+    """Opens Optuna's study; plans the unchanged recipe as first trial, and repeats interrupted trials."""
     study = optuna.create_study(
         storage=_storage(database),
         study_name=_NAME,
@@ -172,14 +174,14 @@ def _begin(search: Search, database: Path) -> Study:
 def _storage(database: Path) -> RDBStorage:
     optuna.logging.set_verbosity(optuna.logging.WARNING)
 
-    def connect() -> sqlite3.Connection:  # not by a URL, in which characters of the path may have a meaning
+    def connect() -> sqlite3.Connection:  # by the path: in a URL, some of its characters have a meaning
         return sqlite3.connect(database, timeout=60, check_same_thread=False)
 
     return RDBStorage("sqlite:///search.db", engine_kwargs={"creator": connect})
 
 
 def make_sampler(name: str, seed: int) -> optuna.samplers.BaseSampler:
-    """Makes one of Optuna's samplers.
+    """Makes Optuna's sampler of this name (``tpe``, ``random`` or ``cmaes``) with a seed.
 
     Raises:
         ImportError: the sampler needs a package that is not installed.
@@ -195,7 +197,7 @@ def make_sampler(name: str, seed: int) -> optuna.samplers.BaseSampler:
 
 
 def _make_pruner(name: str, epochs: int) -> optuna.pruners.BasePruner:
-    if name == "median":  # from two fifths of the epochs on, since success comes late
+    if name == "median":  # prunes after two fifths of the epochs, since success often comes late
         return optuna.pruners.MedianPruner(n_startup_trials=5, n_warmup_steps=2 * epochs // 5)
     if name == "halving":
         return optuna.pruners.SuccessiveHalvingPruner(min_resource=max(epochs // 9, 1), reduction_factor=3)
@@ -203,7 +205,7 @@ def _make_pruner(name: str, epochs: int) -> optuna.pruners.BasePruner:
 
 
 def _counted(study: Study) -> list[FrozenTrial]:
-    """Returns the trials that have begun, except interrupted ones that are repeated."""
+    """Returns the trials that have begun, except those that were interrupted and repeated."""
     trials = study.get_trials(deepcopy=False)
     return [
         trial for trial in trials if trial.state != TrialState.WAITING and _REPEATED not in trial.user_attrs
@@ -211,7 +213,7 @@ def _counted(study: Study) -> list[FrozenTrial]:
 
 
 def _repeat(study: Study, trial: FrozenTrial | Trial, *, attempt: int = 0) -> None:
-    """Ends an interrupted trial; another trial with its values resumes its run."""
+    """Ends an interrupted trial in Optuna's study, and plans a trial that resumes its run."""
     attributes = {name: value for name, value in trial.user_attrs.items() if name == DEFAULT}
     Trial(study, trial._trial_id).set_user_attr(_REPEATED, True)
     study.tell(trial.number, state=TrialState.FAIL)
@@ -230,7 +232,7 @@ class _TrialRuns:
         self._running: dict[Future[Outcome], Trial] = {}
 
     def run(self, trials: int | None, minutes: float | None, *, progress: bool) -> bool:
-        """Runs trials up to a limit; returns whether the user interrupted them."""
+        """Runs trials until a limit is reached; returns whether the user interrupted the search."""
         end = None if minutes is None else time.monotonic() + 60 * minutes
         bar = tqdm(total=trials, initial=self._done(), unit=" trials", disable=None if progress else True)
         with bar, ThreadPoolExecutor(max(self.workers.at_once, 1)) as threads, soft_interrupt() as check:
@@ -266,12 +268,12 @@ class _TrialRuns:
         space, ranges = self.search.space, self.search.space.distributions()
         waiting = self.study.get_trials(deepcopy=False, states=(TrialState.WAITING,))
         if waiting and (default := waiting[0].user_attrs.get(DEFAULT)) is not None:
-            # The first trial lacks options whose values in the recipe are outside of the space.
+            # This trial has the recipe's own values; Optuna must not draw others for those outside the space.
             ranges = {name: ranges[name] for name in space.inside(default)}
         trial = self.study.ask(ranges)
         try:
             recipe = space.recipe(self.search.recipe, trial.params)
-        except ValueError as error:  # invalid combination of values
+        except ValueError as error:  # the values cannot be used together
             self._tell(trial, TrialState.FAIL, error=str(error))
             return
         name = folder_of(trial)
@@ -290,7 +292,7 @@ class _TrialRuns:
             self._end(self._running.pop(future), outcome_of(future))
 
     def _end(self, trial: Trial, outcome: Outcome) -> None:
-        """Passes the result of a trial to Optuna, and writes the table again."""
+        """Passes the result of a trial to Optuna, or repeats the trial if it was interrupted or died."""
         attempt = trial.user_attrs.get(_ATTEMPT, 0)
         if outcome.interrupted:
             _repeat(self.study, trial, attempt=attempt)
@@ -307,7 +309,7 @@ class _TrialRuns:
         else:
             self._tell(trial, TrialState.COMPLETE, value=score(run.rows()))
             return
-        for path in run.checkpoints:  # checkpoints are large, and no longer needed
+        for path in run.checkpoints:  # large files, which a pruned or failed trial no longer needs
             path.unlink(missing_ok=True)
 
     def _tell(self, trial: Trial, state: TrialState, *, value: float | None = None, error: str = "") -> None:
@@ -325,14 +327,14 @@ class _TrialRuns:
 
 
 class _Reporter(Callback):
-    """Reports a trial's score after each epoch, and stops the trial if Optuna prunes it."""
+    """Callback that reports a trial's score to Optuna after each epoch, and stops a trial that it prunes."""
 
     def __init__(self, study: Study, number: int) -> None:
         self.study = study
         self.trial = Trial(study, study.get_trials(deepcopy=False)[number]._trial_id)
 
     def on_epoch(self, run: RunView) -> bool:
-        """Returns whether the trial is pruned; never at its last epoch, nor for the unchanged recipe."""
+        """Returns whether to prune the trial; the unchanged recipe is never pruned, nor the last epoch."""
         epoch = run.trainer.epochs
         self.trial.report(score(run.rows), epoch)
         may_end = epoch < run.components.recipe.run.epochs and DEFAULT not in self.trial.user_attrs
@@ -344,13 +346,13 @@ class _Reporter(Callback):
 
 @contextmanager
 def reporting(*, database: str, number: int, pruner: str, epochs: int) -> Iterator[list[Callback]]:
-    """Context of a trial's run in its worker process; yields the run's callbacks.
+    """Context manager around the run of a trial, in its worker process; yields callbacks of the run.
 
     Args:
         database: Path of the search's database.
         number: Number of the trial.
         pruner: Name of the search's pruner.
-        epochs: Epochs of each trial.
+        epochs: Number of epochs of each trial.
     """
     storage = _storage(Path(database))
     study = optuna.load_study(study_name=_NAME, storage=storage, pruner=_make_pruner(pruner, epochs))

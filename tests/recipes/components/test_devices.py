@@ -174,11 +174,11 @@ def test_what_auto_took_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[st
 @pytest.mark.parametrize(
     ("option", "line"),
     [
-        ("learner.device=cuda", "torchrl-her: learner.device=cuda is not there: "),
-        ("replay.device=cuda:3", "torchrl-her: replay.device=cuda:3 is not there: "),
+        ("learner.device=cuda", "torchrl-her: learner.device=cuda is not available: "),
+        ("replay.device=cuda:3", "torchrl-her: replay.device=cuda:3 is not available: "),
         ("learner.device=gpu", "torchrl-her: learner.device must be auto, cpu, or a device such as cuda or "),
         ("replay.device=auto", "torchrl-her: replay.device must be learner, cpu, or a device such as cuda "),
-        ("learner.device=meta", "torchrl-her: learner.device=meta is not there: "),
+        ("learner.device=meta", "torchrl-her: learner.device=meta is not available: "),
     ],
 )
 def test_what_is_not_there_is_said_in_a_line(

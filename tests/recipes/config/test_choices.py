@@ -42,7 +42,7 @@ def test_a_name_is_taken_once() -> None:
 
 
 def test_a_name_that_resembles_no_other_may_be_one_of_a_module() -> None:
-    with pytest.raises(ValueError, match="got 'xyz'; one of your own must be registered by a module"):
+    with pytest.raises(ValueError, match="got 'xyz'; to use your own, import the module that registers it"):
         make_recipe(behavior="xyz")
 
 

@@ -86,5 +86,5 @@ def test_a_preset_cannot_begin_with_itself(
     monkeypatch.chdir(tmp_path)
     Path("a.yaml").write_text(f"preset: {other}\n")
     Path("b.yaml").write_text("preset: a.yaml\n")
-    with pytest.raises(ValueError, match=r"the preset 'a\.yaml' begins with itself"):
+    with pytest.raises(ValueError, match=r"the preset 'a\.yaml' extends itself"):
         load_preset("a.yaml")

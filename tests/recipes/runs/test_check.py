@@ -162,9 +162,9 @@ def test_what_never_changes_is_told() -> None:
 def test_rewards_that_goals_do_not_explain_are_told() -> None:
     facts = look(cost=0.5)
     assert facts.disagree == 1.0
-    assert said(facts).startswith("100% of the steps have another reward than compute_reward gives")
+    assert said(facts).startswith("in 100% of the steps, the reward differs from compute_reward")
     seldom = said(replace(facts, disagree=0.001, moved=0.002))
-    assert seldom.startswith("less than 1% of the steps have another reward")
+    assert seldom.startswith("in less than 1% of the steps, the reward differs")
     assert "in less than 1% of the episodes" in seldom
     assert "task.options.info_keys=[KEY]" in seldom
 

@@ -109,7 +109,7 @@ def test_actions_at_their_bounds_for_three_epochs_in_a_row() -> None:
     line = only(table(11, success=0.1, saturation=shares), after=6)
     assert line == (
         "seed 5: nearly all greedy actions have been at their bounds for 3 epochs (now 100%), with 10% "
-        "success; this actor may not learn any more. What helps: saturation_penalty above 0.3 or "
+        "success; the actor may have stopped learning. What helps: saturation_penalty above 0.3 or "
         "learning_rate below 0.001 or a larger batch_size"
     )
     assert not any(said(table(3, success=0.5, saturation=1.0)))  # full speed is right
@@ -126,7 +126,7 @@ def test_in_a_curriculum_the_success_of_the_present_stage_counts() -> None:
 )
 def test_values_that_no_return_can_have(q: float, bounds: tuple[float, float]) -> None:
     line = only(table(4, q=[0.0, q, q, q]), after=4, bounds=bounds)  # gamma=0.98: returns up to 50
-    assert "the value of the starts is " in line
+    assert "the critic gives starts a mean value of " in line
     assert "and returns are from " in line
     assert "clamp_targets" not in line  # it is on already
 

@@ -111,5 +111,5 @@ def test_each_job_gets_its_share_of_a_gpu(cluster: Cluster) -> None:
 
 
 def test_no_cluster_is_one_clear_line() -> None:
-    with pytest.raises(ConnectionError, match="no Ray cluster at 127.0.0.1:1 lets us in: .*refused"):
+    with pytest.raises(ConnectionError, match="cannot connect to a Ray cluster at 127.0.0.1:1: .*refused"):
         RayWorkers("127.0.0.1:1")

@@ -1,1 +1,1 @@
-"""Collecting in processes of their own, here or on the nodes of a Ray cluster."""
+"""Collection of experience in separate processes, on this machine or on the nodes of a Ray cluster."""

@@ -1,4 +1,4 @@
-"""Joining a Ray cluster. Needs the extra `cluster`."""
+"""Joins a Ray cluster and queries its resources. Needs the extra `cluster`."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from typing import Any
 import ray
 from ray.exceptions import RayTaskError
 
-_PATIENCE = 5.0  # seconds to wait for an address to answer
+_PATIENCE = 5.0  # seconds to wait for a connection to an address
 
 
 def join(address: str) -> bool:
-    """Makes this process part of a cluster, unless it is already.
+    """Connects this process to a Ray cluster, unless it is connected already.
 
     Args:
-        address: HOST:PORT, or ``auto`` for the one that this machine is a node of.
+        address: HOST:PORT, or ``auto`` for the cluster that this machine is a node of.
 
     Returns:
-        True if this process joined, False if it was part of the cluster already.
+        True if this process was connected, False if it had been connected before.
 
     Raises:
-        ConnectionError: there is no such cluster, or this process is part of another one.
+        ConnectionError: there is no such cluster, or this process is connected to another one.
     """
     if ray.is_initialized():
         current = ray.get_runtime_context().gcs_address
@@ -36,19 +36,19 @@ def join(address: str) -> bool:
             )
         return False
     try:
-        if ":" in address:  # Ray itself would try for minutes
+        if ":" in address:  # tested first, since Ray itself would try to connect for minutes
             host, port = address.rsplit(":", 1)
             socket.create_connection((host, int(port)), timeout=_PATIENCE).close()
         with _signals_kept():
             ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
     except (OSError, RuntimeError, ValueError) as error:
-        raise ConnectionError(f"no Ray cluster at {address} lets us in: {one_line(error)}") from error
+        raise ConnectionError(f"cannot connect to a Ray cluster at {address}: {one_line(error)}") from error
     return True
 
 
 @contextmanager
 def _signals_kept() -> Iterator[None]:
-    """Restores the handler of SIGTERM: Ray sets its own, which ends a run without saving it."""
+    """Restores the handler of SIGTERM after the block: Ray's own would end a run without saving it."""
     before = signal.getsignal(signal.SIGTERM)
     yield
     if threading.current_thread() is threading.main_thread():
@@ -56,17 +56,17 @@ def _signals_kept() -> Iterator[None]:
 
 
 def resource(name: str) -> float:
-    """Returns the present amount of a resource, such as ``CPU``, on all nodes together."""
+    """Returns the total amount of a resource, such as ``CPU``, on all nodes that are alive."""
     return float(ray.cluster_resources().get(name, 0))
 
 
 def gpus() -> list[float]:
-    """Returns the number of GPUs of each node."""
+    """Returns the number of GPUs of each node that is alive."""
     return [float(node["Resources"].get("GPU", 0)) for node in ray.nodes() if node["Alive"]]
 
 
 def one_line(error: Any) -> str:
-    """Returns type and message of an error in one line, without its traceback."""
+    """Returns the message of an error in one line, without the traceback that Ray adds to it."""
     if isinstance(error, RayTaskError):
         return f"{type(error.cause).__name__}: {error.cause}"
     return next(iter(str(error).splitlines()), type(error).__name__)

@@ -1,4 +1,4 @@
-"""Collecting in processes of their own, here or on the nodes of a cluster, while this one learns."""
+"""Collects experience in separate processes, on this machine or on a cluster, while the main one learns."""
 
 from __future__ import annotations
 
@@ -46,14 +46,14 @@ if TYPE_CHECKING:
     from torchrl_her_recipes.components.collection.ray_workers import NodeWorkers
 
 _ON_RAY = "torchrl_her_recipes.components.collection.ray_workers:NodeWorkers"
-_SECONDS = 1.0  # between two checks that all processes still run
+_SECONDS = 1.0  # between two checks that all processes are alive
 _FAILED = "a process failed: worker {} (exit code {})"
 _TRACEBACK = "Worker traceback:"  # TorchRL's message repeats ``__cause__`` below this line
-_EXIT_PRIORITY = 100  # ends processes before Python, at its exit, waits for them
+_EXIT_PRIORITY = 100  # high enough to end the processes before multiprocessing waits for them at exit
 
 
 class CheckedWeightSync(SharedMemWeightSyncScheme):
-    """Weights in shared memory. Unlike TorchRL's own, it does not wait for a process that has ended."""
+    """Sends weights in shared memory. If a process has ended, raises an error; its base class would hang."""
 
     def _wait_for_ack(self, worker_ids: object = None, timeout: float | None = None) -> None:
         for queue in self._ack_queues.values():
@@ -61,7 +61,7 @@ class CheckedWeightSync(SharedMemWeightSyncScheme):
 
 
 class SyncWorkers(MultiSyncCollector):
-    """All processes collect a batch together. Row k of the batch always belongs to the same environment."""
+    """Collector whose processes collect each batch together; row k always belongs to the same environment."""
 
     def __init__(self, *args: Any, **options: Any) -> None:
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="collection")  # waits for batches
@@ -69,20 +69,20 @@ class SyncWorkers(MultiSyncCollector):
         super().__init__(*args, cat_results="stack", **options)
 
     def begin(self, beginnings: Sequence[Beginning]) -> None:
-        """Drops the batches under way, and begins new episodes in all processes."""
+        """Drops the batch that is being collected, if any, and begins new episodes in all processes."""
         if self._batch is not None:
             self._batch.result()
             self._batch = None
         self.map_fn("begin", [(beginning,) for beginning in beginnings])
 
     def ahead(self, weights: TensorDictBase) -> None:
-        """Starts collecting the next batch with these weights of the policy, unless it has been started."""
+        """Starts collecting the next batch with these weights of the policy, if it was not started before."""
         if self._batch is None:
             self.update_policy_weights_(weights)  # while no process reads the shared weights
             self._batch = self._thread.submit(self.next)
 
     def take(self, weights: TensorDictBase) -> TensorDictBase:
-        """Returns the next batch [..., T]; its first dimension may be the processes."""
+        """Returns the next batch: [processes, environments, T], or [environments, T] of a single process."""
         self.ahead(weights)
         assert self._batch is not None
         batch = self._batch.result()
@@ -95,23 +95,23 @@ class SyncWorkers(MultiSyncCollector):
 
 
 class AsyncWorkers(MultiAsyncCollector):
-    """Each process collects its own batches without waiting for others; finished batches queue up."""
+    """Collector whose processes collect batches independently; finished batches wait in a queue."""
 
-    running: bool  # whether each process has a batch under way; TorchRL gives no type
+    running: bool  # whether processes are collecting; declared since TorchRL gives it no type
 
     @property
     def _queue_len(self) -> int:
-        return self.num_workers  # TorchRL's is 1: with a full queue a process would throw its batch away
+        return self.num_workers  # TorchRL's default is 1, but a process drops its batch if the queue is full
 
     def begin(self, beginnings: Sequence[Beginning]) -> None:
-        if self.running:  # TorchRL's own reset() may return batches from before the reset
+        if self.running:  # take the batches under way, which would else be returned after the reset
             for _ in range(self.num_workers):
                 _get(self._get_from_queue, self.procs)
             self.running, self._iterator = False, None
         self.map_fn("begin", [(beginning,) for beginning in beginnings])
 
     def ahead(self, weights: TensorDictBase) -> None:
-        """Does nothing: the processes always collect ahead."""
+        """Does nothing: the processes collect all the time."""
 
     def take(self, weights: TensorDictBase) -> TensorDictBase:
         self.update_policy_weights_(weights)
@@ -122,30 +122,31 @@ Workers: TypeAlias = "SyncWorkers | AsyncWorkers | NodeWorkers"
 
 
 class ProcessCollector(BaseCollector):
-    """Collects in several processes, each with its share of the environments of every run.
+    """Collects in N processes, each of which has E / N of the E environments of each of R runs.
 
-    The processes start when they are first needed and end with :meth:`shutdown`; after that, they start again
-    when needed.
+    The processes start when the first batch is requested. :meth:`shutdown` ends them; the next request for a
+    batch starts them again.
 
     With ``sync=true`` all processes collect a batch [R * E, T] together, where row k always belongs to the
     same environment. After :meth:`collect_ahead` they collect the next batch while the caller learns from
     the last one. The policy that acts in such a batch is always one batch old, and the same seed gives the
     same batches. With ``sync=false`` no process waits for another: a batch [R * E / N, T] comes from the
-    first process that has finished one, and rows carry ids of their environments.
+    process that finishes first, and its rows carry ids of their environments.
 
-    With ``ray=ADDRESS`` the processes are on the nodes of a Ray cluster, see
+    With ``ray=ADDRESS`` the processes run on the nodes of a Ray cluster, see
     :class:`~torchrl_her_recipes.components.collection.ray_workers.NodeWorkers`.
 
-    All random numbers of a process are determined by the seed of each run, the index of the process and the
+    The random numbers of a process depend only on the seeds of the runs, the index of the process and the
     number of resets.
 
     Args:
-        options: Options of collecting.
-        make_env: Makes the environments of a process; takes names of modules to import first, as ``modules``.
+        options: Options of collection.
+        make_env: Function that makes the environments of a process. Its argument ``modules`` has the names of
+            modules to import first.
         policy: Policy whose weights and epsilon are sent to the processes.
         seeds: Seeds of the runs.
         progress: Stages of the runs, which are sent with each reset; None without a curriculum.
-        storing_device: Device of the batches. The processes are on the CPU.
+        storing_device: Device to which batches are moved. The processes use the CPU.
 
     Raises:
         RuntimeError: A process failed while collecting a batch.
@@ -170,7 +171,7 @@ class ProcessCollector(BaseCollector):
         self._workers: Workers | None = None
 
     def next(self) -> TensorDictBase:
-        """Returns the next batch; new episodes begin first if the processes were not running."""
+        """Returns the next batch; if the processes are not running, starts them with new episodes."""
         if self._workers is None:
             self.reset()
         assert self._workers is not None
@@ -179,7 +180,7 @@ class ProcessCollector(BaseCollector):
         return batch if self.storing_device == CPU else batch.to(self.storing_device)
 
     def collect_ahead(self) -> None:
-        """Starts the next batch with the present weights of the policy, and returns at once."""
+        """Starts collecting the next batch with the current weights of the policy, without waiting for it."""
         if self._workers is not None:
             with self._ended_by_errors():
                 self._workers.ahead(self._weights())
@@ -209,14 +210,14 @@ class ProcessCollector(BaseCollector):
         raise NotImplementedError("seeds of processes that collect are those of the recipe: set its seed")
 
     def state_dict(self) -> OrderedDict:
-        """Returns the number of resets, on which alone the random numbers after the next reset depend."""
+        """Returns the number of resets, which with the seeds determines all later random numbers."""
         return OrderedDict(resets=self.resets)
 
     def load_state_dict(self, state_dict: OrderedDict) -> None:
         self.resets = state_dict["resets"]
 
     def _start(self) -> Workers:
-        """Starts the processes, which takes seconds: each of them imports torch."""
+        """Starts the processes. This takes seconds, since each process imports torch."""
         config = self.options
         make = partial(self.make_env, modules=imported_modules())
         frames = len(self.seeds) * share_of_envs(config) * config.steps_per_batch
@@ -227,7 +228,7 @@ class ProcessCollector(BaseCollector):
             return start(processes=config.processes, sync=config.sync)
         _check_main_script(f"processes={config.processes}")
         kind = SyncWorkers if config.sync else AsyncWorkers
-        with _interrupts_later():  # else each process that Ctrl-C ends while it starts prints a traceback
+        with _interrupts_later():  # else Ctrl-C at this moment prints a traceback for each process
             workers = kind(
                 [make] * config.processes,
                 _to_send(self.policy),
@@ -236,7 +237,7 @@ class ProcessCollector(BaseCollector):
                 device="cpu",  # for environments, policy and storage
                 collector_class=WorkerCollector,
                 exploration_type=ExplorationType.RANDOM,
-                num_threads=torch.get_num_threads(),  # TorchRL sets it in this process
+                num_threads=torch.get_num_threads(),  # TorchRL sets this number in the main process
                 num_sub_threads=1,
                 weight_sync_schemes={"policy": CheckedWeightSync()},
                 init_fn=begin_process,
@@ -260,37 +261,37 @@ class ProcessCollector(BaseCollector):
 
     @contextmanager
     def _ended_by_errors(self) -> Iterator[None]:
-        """Ends all processes if one of them failed."""
+        """Context manager that ends all processes if the block raises an error, and explains the error."""
         try:
             yield
         except Exception as error:
             self.shutdown()
             reason, traceback, _ = str(error).partition(_TRACEBACK)
-            if traceback:  # only if a process could not start
+            if traceback:  # TorchRL adds a traceback only if a process could not start
                 raise RuntimeError(f"a process that collects cannot start: {reason.strip()}") from error
             if isinstance(error, RuntimeError) and "process failed" in reason:
                 raise RuntimeError(
-                    "a process that collects has ended, and with it all others; "
-                    f"its own error stands above: {error}"
+                    "a process that collects has failed, and all others were ended; the error of the process "
+                    f"is printed above: {error}"
                 ) from error
             raise
 
 
 def _check_main_script(asked: str) -> None:
-    """Raises a RuntimeError if the main script has no guard: processes that import it would train, too."""
+    """Raises an error if the main script has no ``__name__`` guard: processes import it and would train."""
     path = getattr(sys.modules["__main__"], "__file__", None)
     if path is None or multiprocessing.get_start_method(allow_none=True) == "fork":
         return
     guards = (node.test for node in ast.parse(Path(path).read_bytes()).body if isinstance(node, ast.If))
     if not any("__name__" in ast.unparse(guard) for guard in guards):
         raise RuntimeError(
-            f"{asked} starts processes that import {path}: put what trains there under "
+            f"{asked} starts processes that import {path}: put the code that trains under "
             "`if __name__ == '__main__':`"
         )
 
 
 def _get(get: Callable[..., Any], processes: Sequence[BaseProcess]) -> Any:
-    """Waits for the next item of a queue that processes write to, as long as all of them are alive.
+    """Waits for the next item of a queue that processes write to, as long as all the processes are alive.
 
     Raises:
         RuntimeError: one of the processes has ended.
@@ -305,10 +306,10 @@ def _get(get: Callable[..., Any], processes: Sequence[BaseProcess]) -> Any:
 
 
 def _in_blocks(batch: TensorDictBase, runs: int) -> TensorDictBase:
-    """Returns a batch [R * E, T] with the environments of each run together.
+    """Reorders a batch of several processes, so that the environments of each run are together: [R * E, T].
 
     Args:
-        batch: [N, R * E / N, T] of N processes, or [R * E, T] of one.
+        batch: [N, R * E / N, T] from N processes, or the batch of a single process, which is in order.
         runs: R.
     """
     batch.names = None
@@ -320,10 +321,10 @@ def _in_blocks(batch: TensorDictBase, runs: int) -> TensorDictBase:
 
 
 def _to_send(policy: TensorDictModuleBase) -> TensorDictModuleBase:
-    """Returns a copy of a policy for other processes, which share the memory of its weights.
+    """Returns a copy of a policy on the CPU, which can be sent to other processes.
 
-    The copy has no generators of random numbers: each process makes its own, and a policy with two generators
-    cannot be sent.
+    The copy has no random generators: each process makes its own, and a policy with two generators cannot be
+    sent.
     """
     copy = deepcopy(policy).to(CPU)
     for module in drawing_modules(copy):
@@ -346,7 +347,7 @@ def _end_if_there(workers: weakref.ref[Any]) -> None:
 
 @contextmanager
 def _interrupts_later() -> Iterator[None]:
-    """Holds back Ctrl-C, in this process and in those that it starts."""
+    """Context manager that delays Ctrl-C until its end; processes started in the block ignore Ctrl-C."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return

@@ -1,4 +1,4 @@
-"""Processes that collect on the nodes of a Ray cluster. Needs the extra `cluster`."""
+"""Collects with processes on the nodes of a Ray cluster. Needs the extra `cluster`."""
 
 from __future__ import annotations
 
@@ -18,32 +18,32 @@ from torchrl_her_recipes.components.collection.cluster import join, one_line, re
 from torchrl_her_recipes.components.collection.worker import Beginning, NodeCollector
 
 _SECONDS = 1.0  # between two checks that the cluster still has nodes
-_DEATHS = 3  # after which the run ends, if the process sent no batch in between
+_DEATHS = 3  # largest number of deaths of a process between two of its batches; one more ends the run
 _ON_A_CORE = {"num_cpus": 1, "num_gpus": 0, "scheduling_strategy": "SPREAD"}
 
 
 class NodeWorkers(RayCollector):
-    """Processes on the nodes of a Ray cluster, one core each, which receive weights and return batches.
+    """Collector with processes on the nodes of a Ray cluster, which receive weights and return batches.
 
-    The nodes need only this package. If a node dies, a new process on another node replaces each process that
-    was lost, as soon as a core is free, and begins new episodes. The unfinished batch of a lost process is
-    dropped, and so is the rest of its open episodes. The part of these episodes that was sent is kept, and
-    stored when open episodes are ended (at each epoch of a :class:`~torchrl_her.Trainer`).
+    Each process uses one core. The nodes need only this package. If a node dies, each of its processes is
+    replaced by a new process on another node, as soon as a core is free, which begins new episodes. The
+    unfinished batch of a lost process is dropped. The steps of its open episodes that it sent earlier are
+    kept, and stored when open episodes are ended (at each epoch of a :class:`~torchrl_her.Trainer`).
 
     Args:
         address: address of the cluster, HOST:PORT, or ``auto`` for the cluster of this machine.
-        make_env: makes a process's environments.
+        make_env: function that makes the environments of a process.
         policy: a copy of the policy, on the CPU.
 
     Keyword Args:
         processes: N, the number of processes.
         frames: number of frames in a batch of one process.
-        sync: whether a batch [N, ...] joins all processes; if not, a batch is from the first process ready.
+        sync: True if each batch [N, ...] is from all processes; False if it is from the first that is ready.
 
     Raises:
         ConnectionError: there is no such cluster.
         ValueError: fewer than N cores of the cluster are free.
-        RuntimeError: a process raised an error, or died several times without sending a batch.
+        RuntimeError: a process raised an error, or died repeatedly without sending a batch.
     """
 
     def __init__(
@@ -64,9 +64,9 @@ class NodeWorkers(RayCollector):
             raise ValueError(
                 f"processes={processes} need a core each, but {free} of the cluster's {cores} are free"
             )
-        self._orders: dict[int, ray.ObjectRef] = {}  # the batch that each process is collecting
+        self._orders: dict[int, ray.ObjectRef] = {}  # by process, the batch that it is collecting
         self._beginnings: list[Beginning] = []
-        self._to_begin: set[int] = set()  # processes that are to begin new episodes with their next batch
+        self._to_begin: set[int] = set()  # processes whose next batch must begin with new episodes
         self._lives = [1] * processes
         self._deaths = [0] * processes  # since the last batch of each process
         self._make_env = make_env
@@ -96,13 +96,13 @@ class NodeWorkers(RayCollector):
         self._order(weights, range(self.num_collectors))
 
     def take(self, weights: TensorDictBase) -> TensorDictBase:
-        """Returns the next batch: [N, ...] from all processes, or one from the first that is ready."""
+        """Returns the next batch: [N, ...] from all processes or, without sync, from the first one ready."""
         batches: dict[int, TensorDictBase] = {}
         while len(batches) < (self.num_collectors if self._sync else 1):
             self._order(weights, set(range(self.num_collectors)) - set(batches))
             ready, _ = ray.wait(
                 list(self._orders.values()), timeout=_SECONDS
-            )  # the one that was started first, if several are ready
+            )  # if several are ready, returns the one that was started first
             if not ready and resource("CPU") == 0:
                 raise RuntimeError("no node that could collect is left in the cluster")
             for process in [index for index, order in self._orders.items() if order in ready]:
@@ -114,7 +114,7 @@ class NodeWorkers(RayCollector):
         return next(iter(batches.values()))
 
     def _order(self, weights: TensorDictBase, processes: Iterable[int]) -> None:
-        """Starts collecting a batch in each of the given processes that is idle."""
+        """Starts collecting a batch in those of the given processes that are idle."""
         idle = [process for process in processes if process not in self._orders]
         if not idle:
             return
@@ -134,12 +134,12 @@ class NodeWorkers(RayCollector):
             self._deaths[process] += 1
             if self._deaths[process] > _DEATHS:
                 raise RuntimeError(
-                    f"process {process} of those that collect died {_DEATHS + 1} times without sending a "
+                    f"collecting process {process} died {_DEATHS + 1} times without sending a "
                     f"batch: {one_line(error)}"
                 ) from error
             warnings.warn(
-                f"process {process} of those that collect died, for the {self._lives[process]}. time in this "
-                "run: what it was collecting is lost, and a new process takes its place",
+                f"collecting process {process} died, time {self._lives[process]} in this run: its unfinished "
+                "batch is lost, and a new process replaces it",
                 stacklevel=2,
             )
             self._replace(process)

@@ -1,4 +1,4 @@
-"""The environments and the collector of a process, and the seeds and stages of its new episodes."""
+"""Code that runs in processes that collect: their environments, collectors, and seeds of new episodes."""
 
 from __future__ import annotations
 
@@ -33,20 +33,20 @@ from torchrl_her_recipes.config.imports import import_modules, permit_task
 
 
 def share_of_envs(options: CollectionConfig) -> int:
-    """Returns the number of environments of each run in one process."""
+    """Returns the number of environments that one process has for each run."""
     return options.num_envs // options.processes
 
 
 def make_worker_env(
     envs: TaskEnvs, order: Order, options: CollectionConfig, seeds: Sequence[int], modules: Sequence[str] = ()
 ) -> EnvBase:
-    """Makes a process's share of the environments of all runs: R equal blocks, as their stages see them.
+    """Makes the environments of one process, with the transforms of their stages: R equal blocks for R runs.
 
     Args:
         envs: Maker of the environments. The module that its task names is imported without a check, since
-            the process that sends the maker was permitted to import it.
+            the main process had the permission to import it.
         order: Order of the stages, if there is a curriculum.
-        options: Options of collecting.
+        options: Options of collection.
         seeds: Seeds of the runs.
         modules: Modules to import first, since they may register tasks.
     """
@@ -55,7 +55,8 @@ def make_worker_env(
     env = envs.make(share_of_envs(options), seeds)
     progress = make_progress(order, envs.curriculum, env, seeds)
     env = in_stages(env, progress, begins=is_guided(envs.curriculum, progress))
-    # Without sync, and on nodes that can be replaced, a row's environment does not follow from its position.
+    # Rows need ids if their position does not determine their environment: if batches come from any process,
+    # or processes can be replaced.
     if not options.sync or options.ray is not None:
         env = env if isinstance(env, TransformedEnv) else TransformedEnv(env)
         env.append_transform(EnvIds())
@@ -63,21 +64,21 @@ def make_worker_env(
 
 
 def begin_process() -> None:
-    """Prepares a process for collecting. It must run before environment and policy are made."""
+    """Sets signals and floating-point mode of a collecting process, before its environment is made."""
     if hasattr(os, "setpgrp"):
-        # Ctrl-C and signals to a group of processes must reach the learner only, which ends the others.
+        # Ctrl-C and signals to a process group must reach only the main process, which ends the others.
         os.setpgrp()
-    torch.set_flush_denormal(True)  # as the learner does
+    torch.set_flush_denormal(True)  # as in the main process
 
 
 @dataclass(frozen=True)
 class Beginning:
-    """Seeds and stages that determine the episodes of a process until the next reset.
+    """Seeds and stages with which a process begins new episodes at a reset.
 
     Attributes:
         env_seeds: seeds of the process's environments, one for each run.
-        seeds: seeds of each run's exploration.
-        progress: state of the curriculum, or None.
+        seeds: seeds of exploration, one for each run.
+        progress: state of the curriculum's progress, or None.
     """
 
     env_seeds: list[int]
@@ -85,7 +86,7 @@ class Beginning:
     progress: dict[str, Any] | None = None
 
     def again(self, life: int) -> Beginning:
-        """Returns a copy with new seeds, for the ``life``-th process that replaces a dead one."""
+        """Returns a copy with new seeds, for a process that replaces a dead one; ``life`` counts these."""
         return replace(
             self,
             env_seeds=[derive_seed(seed, life) for seed in self.env_seeds],
@@ -94,7 +95,7 @@ class Beginning:
 
 
 def drawing_modules(policy: nn.Module) -> list[Any]:
-    """Returns the parts of a policy that draw random numbers, each from one generator for each run."""
+    """Returns the modules of a policy that draw random numbers, each with one generator per run."""
     kinds = Exploration | GuidedExploration | StochasticActor
     return [module for module in policy.modules() if isinstance(module, kinds)]
 
@@ -105,10 +106,10 @@ def derive_seed(*numbers: int) -> int:
 
 
 class WorkerCollector(Collector):
-    """Collector of a process; its random numbers begin anew with each reset, so that runs can be resumed."""
+    """Collector in a process. A reset gives it new seeds, so that a resumed run repeats its numbers."""
 
     def begin(self, beginning: Beginning) -> None:
-        """Begins new episodes in all environments."""
+        """Begins new episodes in all environments, with the given seeds and stages."""
         goal_env(self.env).set_seeds(beginning.env_seeds)
         first = beginning.seeds[0]
         torch.manual_seed(first)  # users' policies may draw from torch's own generator
@@ -126,13 +127,13 @@ class WorkerCollector(Collector):
 
 
 class NodeCollector(WorkerCollector):
-    """The collector in a process on a node of a cluster, which gets weights with each request for a batch.
+    """Collector in a process on a node of a cluster; receives weights with each request for a batch.
 
-    Errors are returned as a line of text, since Ray ends a process if some types of errors are raised.
+    Errors are returned as a line of text: Ray would end the process if some types of errors were raised.
     """
 
     def __init__(self, *args: Any, **options: Any) -> None:
-        torch.set_flush_denormal(True)  # as the learner does
+        torch.set_flush_denormal(True)  # as in the main process
         torch.set_num_threads(1)
         self._error = ""  # error of the constructor, if any
         try:
@@ -144,7 +145,7 @@ class NodeCollector(WorkerCollector):
         """Does nothing: weights come with each call of :meth:`collect`."""
 
     def collect(self, weights: TensorDictBase, beginning: Beginning | None = None) -> TensorDictBase | str:
-        """Collects the next batch with these weights, in new episodes if ``beginning`` is given."""
+        """Returns the next batch, in new episodes if ``beginning`` is given, or the message of an error."""
         if self._error:
             return self._error
         try:
@@ -157,5 +158,5 @@ class NodeCollector(WorkerCollector):
 
 
 def _progress_of(env: TransformedEnv) -> CurriculumProgress:
-    """Returns the progress that an environment's transforms read stages from."""
+    """Returns the progress from which an environment's transforms read the stages of runs."""
     return next(transform.progress for transform in env.transform if isinstance(transform, StateToObs))

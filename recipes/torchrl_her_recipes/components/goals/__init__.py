@@ -1,1 +1,1 @@
-"""The space of goals, weights of virtual goals, and goals that training proposes."""
+"""Makers for goals: the space of a task's goals, weights of virtual goals, and proposed goals."""

@@ -1,4 +1,4 @@
-"""Makers of the goals that training proposes before an episode, for :mod:`...config.choices.behavior`."""
+"""Makes the transforms that propose goals of training episodes, for :mod:`...config.choices.behavior`."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def make_behavior(
     space: GoalSpace | KernelSpace | None,
     state: CurriculumState | None,
 ) -> BehaviorGoals | None:
-    """Returns the transform that proposes goals; None if episodes ask for the task's goals alone."""
+    """Makes the transform that proposes goals; returns None if episodes have only the task's goals."""
     if not isinstance(options, Proposed):
         return None
     runs, rewards = len(seeds), reward_range(goal_env(env))
@@ -57,7 +57,7 @@ def make_behavior(
 
 
 def make_asking(seeds: Sequence[int], env: EnvBase, *, memory: int) -> BehaviorGoals:
-    """Returns a transform for evaluation: episodes ask for the goals that are put into its memory."""
+    """Makes a transform for evaluation that gives episodes the goals in its memory, set by the caller."""
     return _goals(seeds, env, remember=False, real_share=0.0, candidates=1, memory=memory)
 
 
@@ -73,12 +73,12 @@ def _goals(seeds: Sequence[int], env: EnvBase, **options: Any) -> BehaviorGoals:
 
 
 def make_uniform(_options: Proposed, goals: MakeGoals, **_: Any) -> BehaviorGoals:
-    """Proposes any achieved goal."""
+    """Makes a transform that proposes any achieved goal, with equal probability."""
     return goals()
 
 
 def make_ibs(options: IBS, goals: MakeGoals, *, runs: int, space: Any, **_: Any) -> BehaviorGoals:
-    """Proposes goals in proportion to q* - q, where q counts proposed goals."""
+    """Makes a transform that proposes goals in proportion to q* - q, where q counts proposed goals."""
     weights = [make_instructive(options, space=space) for _ in range(runs)]
     return goals(weights=weights, update_on="proposed", candidates=options.candidates)
 
@@ -93,18 +93,18 @@ def make_mega(
     values: MakeValues,
     **_: Any,
 ) -> BehaviorGoals:
-    """Proposes the rarest achieved goal whose value by the critic is above a cutoff."""
+    """Makes a transform that proposes the rarest achieved goal whose value exceeds a cutoff."""
     cutoffs = scaled_cutoffs(options.cutoff, learner.gamma, rewards)
     factors = [InverseDensity(), ValueCutoff(values(), runs=runs, **cutoffs)]
     return goals(factors=factors, greedy=True, candidates=options.candidates)
 
 
 def scaled_cutoffs(cutoff: float, gamma: float, rewards: tuple[float, float]) -> dict[str, float]:
-    """Returns the arguments of ``ValueCutoff`` for a cutoff that is given for rewards of -1 and 0."""
+    """Converts a cutoff for rewards of -1 and 0 to arguments of ``ValueCutoff`` for the task's rewards."""
     missed, achieved = rewards
 
     def value(cutoff: float) -> float:
-        reached = min(1.0, max(0.0, 1.0 + cutoff * (1.0 - gamma)))  # gamma^d for a goal d steps away
+        reached = min(1.0, max(0.0, 1.0 + cutoff * (1.0 - gamma)))  # gamma^d, if the goal is d steps away
         return missed * (1.0 - reached) / (1.0 - gamma) + achieved * reached
 
     floor, step = value(-1.0 / (1.0 - gamma)), abs(value(-1.0) - value(0.0))
@@ -114,8 +114,8 @@ def scaled_cutoffs(cutoff: float, gamma: float, rewards: tuple[float, float]) ->
 def make_discover(
     options: Discover, goals: MakeGoals, *, learner: LearnerConfig, runs: int, values: MakeValues, **_: Any
 ) -> BehaviorGoals:
-    """Proposes the achievable and new goal that leads farthest towards the task's goal."""
-    several = getattr(learner, "critics", 1) > 1  # goals on which critics disagree are new
+    """Makes a transform that proposes new, achievable goals that lead toward the task's goal (DISCOVER)."""
+    several = getattr(learner, "critics", 1) > 1  # a goal is new if critics disagree on its value
     score = DiscoverScore(values(), runs=runs)
     factors = [score] if several else [InverseDensity(), score]
     return goals(factors=factors, greedy=True, candidates=options.candidates)

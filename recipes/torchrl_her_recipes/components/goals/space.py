@@ -1,4 +1,4 @@
-"""The space that the goals of a task lie in."""
+"""Finds the space in which the goals of a task lie, for weights that count goals or estimate densities."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from torchrl_her_recipes.components.streams import Stream
 from torchrl_her_recipes.config.choices.weights import Equal, SequentialIBS
 from torchrl_her_recipes.config.groups import Group
 
-_SAMPLES = 10_000  # goals that are drawn if goals do not fill a box
-_RESETS = 1_000  # episodes whose goals are collected, if the environment has no distribution of goals
-MOST_DIMENSIONS = 3  # of a grid
+_SAMPLES = 10_000  # number of goals that are drawn from a distribution that is not uniform in a box
+_RESETS = 1_000  # number of resets whose goals are collected if the environment states no distribution
+MOST_DIMENSIONS = 3  # largest number of dimensions of a grid
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,8 @@ class GoalSpace:
 
     Attributes:
         grid: cells that cover the goals.
-        target_at: returns q* [cells], the task's goals smoothed by a sigma that is in the unit of the goals.
+        target_at: function of sigma that returns q* [cells], the distribution of the task's goals smoothed by
+            a Gaussian of this sigma, in the unit of the goals.
         sigma: the final sigma.
     """
 
@@ -41,16 +42,16 @@ class GoalSpace:
 
     @property
     def target(self) -> Tensor:
-        """q* [cells] at the final sigma, to which reported divergences are measured."""
+        """q* [cells] at the final sigma, the reference of reported divergences."""
         return self.target_at(self.sigma)
 
 
 @dataclass(frozen=True)
 class KernelSpace:
-    """Goals of the task itself, for weights that use kernel densities instead of a grid.
+    """A sample of a task's own goals, for weights that use kernel densities instead of a grid.
 
     Attributes:
-        goals: n goals with g coordinates, [n, g].
+        goals: [n, g], n goals with g coordinates.
         sigma: the final sigma, in the unit of the goals.
     """
 
@@ -59,10 +60,11 @@ class KernelSpace:
 
 
 def goal_space(options: Group, envs: TaskEnvs, env: EnvBase, num_envs: int) -> GoalSpace | KernelSpace | None:
-    """Returns the space of a task's goals: the range that the task states, or a box around sampled goals.
+    """Returns the space of a task's goals, as the options need it.
 
-    For kernel densities, the space is a sample of goals. It is None if the options need no space, or if goals
-    are merely counted and the task states no range.
+    A :class:`GoalSpace` covers the range of goals that the task states or, if it states none, a box around
+    sampled goals. For kernel densities, a :class:`KernelSpace` has a sample of goals. None is returned if the
+    options need no space, or if goals are only counted (equal weights) and the task states no range.
 
     Args:
         options: Options of weights or of behavior goals.
@@ -81,8 +83,8 @@ def goal_space(options: Group, envs: TaskEnvs, env: EnvBase, num_envs: int) -> G
         return None if box is None else _given(name, task, options, *box)
     if task.starts_near_goals:
         raise ValueError(
-            f"IBS must not be used on {name}: its goals lie around its start states, so "
-            "the goals that it would prefer are achieved without doing anything; choose a throwing task"
+            f"IBS must not be used on {name}: the goals of this task lie around its start states, so the "
+            "goals that IBS prefers would be achieved without any action; choose a throwing task"
         )
     if _without_grid(name, options.estimator, goal_width(task)):
         return _kernel(name, task, options, box, _desired_goals(envs, task, num_envs))
@@ -92,12 +94,12 @@ def goal_space(options: Group, envs: TaskEnvs, env: EnvBase, num_envs: int) -> G
 
 
 def goal_width(env: Any) -> int:
-    """Returns the number of entries of a task's goal."""
+    """Returns the number of coordinates of a task's goals."""
     return int(env.observation_spec["desired_goal"].shape[-1])
 
 
 def _without_grid(task: str, choice: str, width: int) -> bool:
-    """Returns whether q* and q are kernel densities, not histograms over a grid."""
+    """Returns whether q* and q are estimated by kernel densities instead of histograms over a grid."""
     if choice == "grid" and width > MOST_DIMENSIONS:
         raise ValueError(
             f"estimator=grid needs goals of at most {MOST_DIMENSIONS} numbers, and those of {task} have "
@@ -107,7 +109,7 @@ def _without_grid(task: str, choice: str, width: int) -> bool:
 
 
 def _kernel(task: str, env: Any, options: SequentialIBS, box: Box | None, goals: Tensor) -> KernelSpace:
-    """Returns goals of the task. Its default sigma grows with the root of their width, as distances do."""
+    """Makes the space for kernel densities; its default sigma grows as distances do with more coordinates."""
     if options.recent is not None:
         raise ValueError(
             f"recent={options.recent} has no effect on {task}, where q is a kernel density: leave it out"
@@ -119,7 +121,7 @@ def _kernel(task: str, env: Any, options: SequentialIBS, box: Box | None, goals:
 
 
 def _given(task: str, env: Any, options: Equal, low: Sequence[float], high: Sequence[float]) -> GoalSpace:
-    """Returns the range of goals that an environment states."""
+    """Makes a grid over the range of goals that an environment states."""
     goals = env.goal_distribution
     grid = GoalGrid(low, high, [options.cells] * len(low))
     target: Callable[[float], Tensor]
@@ -132,17 +134,17 @@ def _given(task: str, env: Any, options: Equal, low: Sequence[float], high: Sequ
 
 
 def _sampled(env: Any, options: SequentialIBS, goals: Tensor) -> GoalSpace:
-    """Returns a box around goals of the task, half as wide again on each side."""
+    """Makes a grid over a box around sampled goals, with a margin of half their range on each side."""
     low, high = goals.amin(0), goals.amax(0)
     width = float((high - low).max()) or 1.0
     margin = torch.where(high > low, (high - low) / 2, width / 2)
-    # This box is a guess, so goals outside of it count at its edge without a warning.
+    # The box is a guess, so goals outside of it are expected: they count at its edge without a warning.
     grid = GoalGrid(low - margin, high + margin, [options.cells] * goals.shape[-1], warn=False)
     return GoalSpace(grid, partial(sampled_target, grid, goals), _share(options, env) * width)
 
 
 def _desired_goals(envs: TaskEnvs, env: Any, num_envs: int) -> Tensor:
-    """Returns desired goals of episodes, [n, g] of float64."""
+    """Returns a sample of the task's desired goals, [n, g] of float64."""
     distribution = getattr(env, "goal_distribution", None)
     if distribution is not None:
         return distribution.sample(_SAMPLES, generator=torch.Generator().manual_seed(0)).double()
@@ -152,5 +154,5 @@ def _desired_goals(envs: TaskEnvs, env: Any, num_envs: int) -> Tensor:
 
 
 def _share(options: Equal, env: Any) -> float:
-    """Returns the final sigma as a share of the width of the goals' space."""
+    """Returns the final sigma as a fraction of the range of goals: the option, or the task's default."""
     return getattr(options, "sigma", None) or env.goal_sigma

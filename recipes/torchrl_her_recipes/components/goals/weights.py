@@ -1,4 +1,4 @@
-"""Makers of the weights of virtual goals, which the choices in :mod:`...config.choices.weights` name."""
+"""Makes the weights of virtual goals for the choices in :mod:`...config.choices.weights`."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from torchrl_her_recipes.config.choices.weights import IBS, RND, Equal, Rare, Se
 
 
 def make_counts(options: Equal, *, space: Any, **_: Any) -> GoalHistogram | None:
-    """Counts goals and gives all of them the same weight."""
+    """Makes weights that are equal for all goals and count goals; None if the space of goals is unknown."""
     return GoalHistogram(space.grid, recent=options.recent) if space is not None else None
 
 
 def make_instructive(
     options: SequentialIBS, *, space: GoalSpace | KernelSpace, **_: Any
 ) -> InstructiveWeights:
-    """Prefers goals near the real ones (IBS)."""
+    """Makes weights that prefer goals near the task's own goals (IBS)."""
     shared = ("start_factor", "decay", "floor")
     names = shared if isinstance(space, KernelSpace) else (*shared, "floor_is_relative", "recent")
     keywords: dict[str, Any] = {name: value for name, value in vars(options).items() if name in names}
@@ -32,7 +32,7 @@ def make_instructive(
 
 
 def make_rare(options: Rare, *, env: Any, **_: Any) -> RareGoals:
-    """Prefers goals with few others around: by a kernel density or, in many dimensions, by neighbors."""
+    """Makes weights that prefer rare goals, by a kernel density or, in many dimensions, by neighbors."""
     return RareGoals(
         estimator="kernel" if goal_width(env) <= MOST_DIMENSIONS else "neighbors",
         sharpness=options.sharpness,
@@ -41,5 +41,5 @@ def make_rare(options: Rare, *, env: Any, **_: Any) -> RareGoals:
 
 
 def make_network_novelty(options: RND, *, seed: int, **_: Any) -> NetworkNovelty:
-    """Prefers goals that are new to a network (RND), which is initialized from the run's seed."""
+    """Makes weights that prefer goals that are new to a network (RND), initialized by the run's seed."""
     return NetworkNovelty(seed=seed, sharpness=1.0 if options.sharpness is None else options.sharpness)

@@ -1,1 +1,1 @@
-"""Sections of a recipe that are one of several classes, each with options of its own."""
+"""Alternatives for sections of a recipe, such as the learner: for each, a class with its options."""

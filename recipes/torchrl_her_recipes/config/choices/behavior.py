@@ -1,4 +1,4 @@
-"""Choices of behavior goals, with their options; the makers are in :mod:`..components.goals.behavior`."""
+"""Options of the sources of training goals, made by functions in :mod:`..components.goals.behavior`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _MAKERS = "torchrl_her_recipes.components.goals.behavior"
 
 @dataclass(frozen=True, kw_only=True)
 class Behavior(Choice):
-    """Which goals the episodes of training ask for (behavior goals)."""
+    """Goals that training episodes try to achieve (behavior goals)."""
 
 
 BEHAVIOR = Kind("behavior", Behavior, default="real")
@@ -29,29 +29,29 @@ class Real(Behavior):
 
 @dataclass(frozen=True, kw_only=True)
 class Proposed(Behavior):
-    """Base class of choices that, in some of the episodes, ask for goals that were achieved before.
+    """Base class of choices that replace the task's goal, in some episodes, by a goal achieved earlier.
 
-    The maker takes the options and the function ``goals``. It calls ``goals`` with ``weights``, ``factors``
-    and the like, and returns the :class:`~torchrl_her.behavior.BehaviorGoals` that this makes. Keyword
+    The maker takes these options and a function ``goals``. It returns the result of calling ``goals`` with
+    arguments of :class:`~torchrl_her.behavior.BehaviorGoals`, such as ``weights`` or ``factors``. Keyword
     arguments of the maker:
 
     - ``learner``: options of the learner;
     - ``runs``: number of runs;
     - ``rewards``: rewards of a missed and of an achieved goal;
-    - ``space``: space of the task's goals, for options of IBS;
+    - ``space``: space of the task's goals; None unless the options are a subclass of ``Equal`` weights;
     - ``values``: function that makes the :class:`~torchrl_her.behavior.GoalValues` of the agent.
     """
 
     real_share: float = option(
         0.5, "share of the episodes that keep the task's own goals", at_least=0, at_most=1
     )
-    goal_memory: int = option(50_000, "newest achieved goals that are remembered", at_least=1)
+    goal_memory: int = option(50_000, "number of the newest achieved goals that are remembered", at_least=1)
 
 
 @BEHAVIOR.register
 @dataclass(frozen=True, kw_only=True)
 class UniformAchieved(Proposed):
-    """Any achieved goal."""
+    """Any goal that was achieved before, with equal probability."""
 
     name = "uniform_achieved"
     maker = f"{_MAKERS}:make_uniform"
@@ -59,7 +59,7 @@ class UniformAchieved(Proposed):
 
 @dataclass(frozen=True, kw_only=True)
 class _OneOfSome(Proposed):
-    candidates: int = option(100, "achieved goals of which one is proposed", at_least=1)
+    candidates: int = option(100, "number of achieved goals drawn, one of which is proposed", at_least=1)
 
 
 @BEHAVIOR.register
@@ -74,12 +74,12 @@ class IBS(IBSWeights, _OneOfSome):
 @BEHAVIOR.register
 @dataclass(frozen=True, kw_only=True)
 class Mega(_OneOfSome):
-    """Rare goals that the critic believes in (Pitis et al., 2020)."""
+    """Rare goals that the critic considers achievable (Pitis et al., 2020)."""
 
     name = "mega"
     maker = f"{_MAKERS}:make_mega"
 
-    cutoff: float = option(-3.0, "lowest value of a proposed goal at first, for rewards of -1 and 0")
+    cutoff: float = option(-3.0, "initial lower bound of a proposed goal's value, for rewards of -1 and 0")
 
 
 @BEHAVIOR.register

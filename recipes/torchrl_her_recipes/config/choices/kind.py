@@ -1,4 +1,4 @@
-"""Choices of a recipe: sections that are one of several classes, each with options of its own."""
+"""Base class and registry of the alternatives ("choices") for a section of a recipe."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from torchrl_her_recipes.config.options import REGISTERED, nearest
 
 @dataclass(frozen=True, kw_only=True)
 class Choice(Group):
-    """Base class of the alternatives for a section: fields are options, the docstring begins with a summary.
+    """Base class of the alternatives for a section. Fields are options; the docstring's first line is shown.
 
     Attributes:
-        name: Name that recipes take.
+        name: Name by which recipes refer to the choice.
         maker: Function or class that makes the component, as ``module:name``; imported when a run is built.
     """
 
@@ -26,9 +26,9 @@ C = TypeVar("C", bound=Choice)
 
 
 class Kind(dict[str, type[C]]):
-    """Registry of the choices for one section of a recipe: their classes by name.
+    """Registry of the choices for one section of a recipe: a mapping from names to classes.
 
-    A call makes an instance: ``kind(name="mega", cutoff=-5.0)`` is the choice ``mega`` with this cutoff.
+    Calling the registry makes a section: ``BEHAVIOR(name="mega", cutoff=-5.0)`` is a ``Mega`` instance.
 
     Args:
         section: Name of the section.
@@ -50,7 +50,7 @@ class Kind(dict[str, type[C]]):
         return choice(**values)
 
     def register(self, choice: type[C]) -> type[C]:
-        """Registers a choice by its name; decorates its class."""
+        """Class decorator that registers a choice under its ``name``."""
         if choice.name in self:
             raise ValueError(f"there is a {self.section} {choice.name!r} already")
         self[choice.name] = choice
@@ -64,5 +64,5 @@ class Kind(dict[str, type[C]]):
         return self[str(name)]
 
     def summaries(self) -> dict[str, str]:
-        """Returns the first line of each choice's docstring."""
+        """Returns the first line of each choice's docstring, by name."""
         return {name: str(choice.__doc__).split("\n")[0].rstrip(".") for name, choice in self.items()}

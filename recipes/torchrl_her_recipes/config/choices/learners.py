@@ -1,4 +1,4 @@
-"""Choices of the learner, with their options; the makers are in :mod:`..components.learners`."""
+"""Options of the learners (DDPG, SAC, ...), whose builders are in :mod:`..components.learners`."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from torchrl_her_recipes.config.options import AUTO, Needs, option
 Actions = Literal["continuous", "discrete"]
 
 _MAKERS = "torchrl_her_recipes.components.learners"
-_CRITICS = "how many critics there are; targets have the least of their values"
-_CLAMPED = "whether targets are clamped to the returns that rewards allow, where rewards have bounds"
-_TARGET_CRITICS = "number of critics, drawn in each step, whose least value is the target; 0 uses all"
+_CRITICS = "number of critics; targets use the least of their values"
+_CLAMPED = "whether targets are clamped to the range of possible returns, if rewards are bounded"
+_TARGET_CRITICS = "number of critics, drawn in each gradient step, whose least value targets use; 0: all"
 
 
 def _norm(*more: str, text: str = "") -> Any:
@@ -23,14 +23,14 @@ def _norm(*more: str, text: str = "") -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class LearnerConfig(Choice):
-    """The learner and its networks. Its maker is a ``LearnerBuilder``.
+    """The learner and its networks. Its ``maker`` names a subclass of ``LearnerBuilder``.
 
     Attributes:
-        actions: kinds of actions that it supports.
+        actions: kind of actions that the learner supports.
         stacks: whether several runs can be trained side by side in one program.
-        priority_power: its loss gives each transition the absolute TD error to this power as a priority.
-        has_epsilon: whether a share epsilon of the actions explores.
-        clones: whether its loss can clone the behavior of demonstrations.
+        priority_power: power of the absolute TD error that the loss writes as a transition's priority.
+        has_epsilon: whether a fraction epsilon of the actions explores.
+        clones: whether the loss can clone the behavior of demonstrations.
     """
 
     needs: ClassVar[Needs] = (
@@ -50,48 +50,48 @@ class LearnerConfig(Choice):
         """Number of weights between hidden layers, in the actor and all critics."""
         return (self.depth - 1) * self.hidden**2 * (1 + getattr(self, "critics", 1))
 
-    device: str = option("cpu", "where the networks are: cpu, cuda, cuda:1, ..., or auto")
+    device: str = option("cpu", "device of the networks: cpu, cuda, cuda:1, ..., or auto")
     gamma: float = option(
-        AUTO, "discount factor; auto: 1 - 2 / steps of an episode, from 0.9 to 0.99", above=0, below=1
+        AUTO, "discount factor; auto: 1 - 2 / (steps of an episode), within 0.9 to 0.99", above=0, below=1
     )
     learning_rate: float = option(1e-3, "learning rate of Adam", above=0)
     max_grad_norm: float = option(
-        3.0, "gradients of each network are clipped to this norm", above=0, infinite=True
+        3.0, "norm to which the gradients of each network are clipped", above=0, infinite=True
     )
     hidden: int = option(256, "width of the hidden layers", at_least=1)
     depth: int = option(3, "number of hidden layers of the networks, at least 2", at_least=2)
-    activation: str = option("relu", "behind each hidden layer", choices=("relu", "tanh", "elu"))
+    activation: str = option("relu", "activation after each hidden layer", choices=("relu", "tanh", "elu"))
     norm: str = _norm()
     normalize: bool = option(
-        True, "whether observations and goals are normalized, by mean and deviation of all that was written"
+        True, "whether observations and goals are normalized by the mean and deviation of stored transitions"
     )
     normalize_clip: float = option(
-        5.0, "normalized values are clipped to plus and minus this", above=0, infinite=True
+        5.0, "largest absolute value after normalization; larger ones are clipped", above=0, infinite=True
     )
     normalize_least_std: float | None = option(
         None,
-        "least deviation that values are divided by; 1/10,000 of each entry's mean if not given",
+        "least standard deviation to divide by; if not given, 1/10,000 of each entry's mean",
         above=0,
     )
     tau: float = option(0.05, "rate of the soft target update", at_least=0, at_most=1)
     ema_decay: float = option(
         0.9995,
-        "what stays, in a gradient step, of the average of the actor's weights that is evaluated and kept; "
-        "0: no average",
+        "decay, per gradient step, of the moving average of the actor's weights; this average is evaluated "
+        "and saved; 0: no average",
         at_least=0,
         below=1,
     )
     hard_update_interval: int = option(0, "gradient steps between hard target updates; 0: soft", at_least=0)
     compile: str = option(
         "auto",
-        "compiled gradient steps, in C++ or, on a GPU, as CUDA graphs; auto: where that is possible; always: "
-        "on a GPU through torch.compile, too",
+        "whether gradient steps are compiled, to C++ on a CPU or CUDA graphs on a GPU; auto: if possible; "
+        "always: or raise an error, and on a GPU also apply torch.compile",
         choices=("auto", "always", "never"),
     )
     matmul_dtype: str = option(
         "float32",
-        "numbers that compiled gradient steps multiply between hidden layers; bfloat16: a third less time at "
-        "hidden=256 where the processor has AVX512-BF16, more elsewhere",
+        "number type of products between hidden layers in compiled gradient steps; bfloat16 takes a third "
+        "less time at hidden=256 if the processor has AVX512-BF16, and more time otherwise",
         choices=("float32", "bfloat16"),
     )
 
@@ -116,7 +116,7 @@ class EpsilonConfig(LearnerConfig):
     has_epsilon: ClassVar[bool] = True
 
     epsilon_start: float = option(0.5, "share of exploring actions in the first epoch", at_least=0, at_most=1)
-    epsilon_decay: float = option(0.9, "factor of epsilon each epoch", above=0, at_most=1)
+    epsilon_decay: float = option(0.9, "factor by which epsilon shrinks each epoch", above=0, at_most=1)
     epsilon_end: float = option(0.1, "lowest epsilon", at_least=0, at_most=1)
 
     def __post_init__(self) -> None:
@@ -131,9 +131,9 @@ class EpsilonConfig(LearnerConfig):
 class NoiseConfig(EpsilonConfig):
     """A learner with a deterministic policy of continuous actions.
 
-    Of its actions, the share ``epsilon * uniform_share`` is drawn uniformly, noise is added to
-    ``epsilon * (1 - uniform_share)``, and all others are greedy. With ``epsilon_start=1 epsilon_end=1`` every
-    action that is not uniform has noise.
+    A fraction ``epsilon * uniform_share`` of the actions is drawn uniformly. Another fraction,
+    ``epsilon * (1 - uniform_share)``, is greedy with noise added, and all other actions are greedy. With
+    ``epsilon_start=1 epsilon_end=1`` every action is uniform or has noise.
     """
 
     needs: ClassVar[Needs] = (
@@ -142,10 +142,10 @@ class NoiseConfig(EpsilonConfig):
     )
 
     action_noise: float = option(
-        0.1, "standard deviation of noise on exploring actions, as a share of their range", at_least=0
+        0.1, "standard deviation of noise on exploring actions, as a fraction of their range", at_least=0
     )
     uniform_share: float = option(
-        0.6, "share of exploring actions that are uniform; the others have noise", at_least=0, at_most=1
+        0.6, "share of exploring actions that are uniformly random; others have noise", at_least=0, at_most=1
     )
 
 
@@ -158,10 +158,10 @@ class DDPGConfig(NoiseConfig):
     maker = f"{_MAKERS}:DDPGBuilder"
     clones: ClassVar[bool] = True
 
-    norm: str = _norm("batch", text=": layer, in all networks; batch, in the critic, and of its input")
-    action_penalty: float = option(0.0, "action L2 penalty, which pulls all actions towards 0", at_least=0)
+    norm: str = _norm("batch", text="; layer: in all networks; batch: in the critic only, with its input")
+    action_penalty: float = option(0.0, "weight of the L2 penalty that pulls actions to 0", at_least=0)
     saturation_penalty: float = option(
-        0.3, "penalty on actions at the ends of tanh, from where an actor does not learn", at_least=0
+        0.3, "weight of the penalty on actions near the ends of tanh, where gradients vanish", at_least=0
     )
     clamp_targets: bool = option(True, _CLAMPED)
 
@@ -180,7 +180,7 @@ class _SomeCritics(LearnerConfig):
 @LEARNERS.register
 @dataclass(frozen=True, kw_only=True)
 class TD3Config(_SomeCritics, DDPGConfig):
-    """Two critics and smoothed targets (Fujimoto et al., 2018)."""
+    """TD3: two critics and smoothed targets (Fujimoto et al., 2018)."""
 
     name = "td3"
     maker = f"{_MAKERS}:TD3Builder"
@@ -195,12 +195,12 @@ class EntropyConfig(LearnerConfig):
     priority_power = 1
     clones: ClassVar[bool] = True
 
-    temperature: float = option(0.1, "the temperature that learning begins with", above=0)
+    temperature: float = option(0.1, "initial temperature of the entropy term", above=0)
     action_penalty: float = option(
-        0.3, "action L2 penalty, which keeps actions off the ends of tanh", at_least=0
+        0.3, "weight of the L2 penalty that keeps actions off the ends of tanh", at_least=0
     )
     clamp_targets: bool = option(
-        False, "whether targets are clamped to the returns that rewards allow, which entropy may exceed"
+        False, "whether targets are clamped to the range of possible returns, ignoring the entropy term"
     )
 
 
@@ -216,7 +216,7 @@ class SACConfig(_SomeCritics, EntropyConfig):
 @LEARNERS.register
 @dataclass(frozen=True, kw_only=True)
 class REDQConfig(SACConfig):
-    """SAC with ten critics, targets of two of them at random (Chen et al., 2021)."""
+    """SAC with ten critics, two of which, drawn at random, give the target (Chen et al., 2021)."""
 
     name = "redq"
 
@@ -227,15 +227,15 @@ class REDQConfig(SACConfig):
 @LEARNERS.register
 @dataclass(frozen=True, kw_only=True)
 class TQCConfig(EntropyConfig):
-    """SAC whose critics give quantiles, the greatest left out (Kuznetsov et al., 2020)."""
+    """SAC whose critics predict quantiles; targets leave out the greatest (Kuznetsov et al., 2020)."""
 
     name = "tqc"
     maker = f"{_MAKERS}:TQCBuilder"
 
-    critics: int = option(2, "how many critics there are; targets have all of their quantiles", at_least=1)
-    quantiles: int = option(25, "quantiles of the return that each critic gives", at_least=1)
+    critics: int = option(2, "number of critics; targets use the quantiles of all of them", at_least=1)
+    quantiles: int = option(25, "number of quantiles of the return that each critic predicts", at_least=1)
     dropped_quantiles: int = option(
-        2, "number of the greatest quantiles of each critic that targets leave out", at_least=0
+        2, "number of quantiles, the greatest ones, that targets leave out for each critic", at_least=0
     )
 
     def __post_init__(self) -> None:

@@ -1,4 +1,4 @@
-"""Choices of goal weights, with their options; the makers are in :mod:`..components.goals.weights`."""
+"""Options of the weights of virtual goals, made by functions in :mod:`..components.goals.weights`."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ _MAKERS = "torchrl_her_recipes.components.goals.weights"
 
 @dataclass(frozen=True, kw_only=True)
 class Weights(Choice):
-    """Which virtual goals are preferred.
+    """Weights by which virtual goals are drawn.
 
-    The maker is called once for each run. It takes the options and by keyword ``env``, ``seed`` (of the run)
-    and ``space`` (of the task's goals, for subclasses of :class:`Equal`), and returns new
-    :class:`~torchrl_her.GoalWeights`.
+    The maker is called once for each run, and returns new :class:`~torchrl_her.GoalWeights`. It takes the
+    options and the keyword arguments ``env``, ``seed`` (the run's seed) and ``space`` (the space of the
+    task's goals; None unless the options are a subclass of :class:`Equal`).
     """
 
 
@@ -26,14 +26,14 @@ WEIGHTS = Kind("weights", Weights, default="none")
 
 @dataclass(frozen=True, kw_only=True)
 class Equal(Weights):
-    """Gives all goals equal weight; counts goals of a known range, for the metric kl."""
+    """Equal weight for all goals; if their range is known, they are counted for the metric kl."""
 
     name = "none"
     maker = f"{_MAKERS}:make_counts"
 
     cells: int = option(20, "cells along each dimension of the grid that goals are counted in", at_least=1)
     recent: int | None = option(
-        None, "number of the newest goals that q counts; all since the buffer was emptied if None", at_least=1
+        None, "number of newest goals that q counts; if None, all since the buffer was emptied", at_least=1
     )
 
 
@@ -46,14 +46,14 @@ class SequentialIBS(Equal):
     needs: ClassVar[Needs] = (("estimator", "kernel".__ne__, "cells recent"),)
 
     sigma: float | None = option(
-        None, "width of the kernel around the real goals, as a share of the range of goals", above=0
+        None, "width of the kernel around the task's goals, as a fraction of the range of goals", above=0
     )
-    start_factor: float = option(3.0, "sigma begins at this multiple of its final value", at_least=1)
-    decay: float = option(0.9, "the kernel's covariance is multiplied by this each epoch", above=0, at_most=1)
+    start_factor: float = option(3.0, "initial sigma, as a multiple of the final sigma", at_least=1)
+    decay: float = option(0.9, "factor of the kernel's covariance in each epoch", above=0, at_most=1)
     estimator: str = option(
         "auto",
-        "what q* and q are: grid (histograms, for goals of up to three numbers), kernel (densities, for any "
-        "goals), or auto (kernel for more than three numbers)",
+        "how q* and q are estimated: grid (histograms, for goals of at most 3 coordinates), kernel "
+        "(densities, for any goals), or auto (grid for at most 3 coordinates, else kernel)",
         choices=("auto", "grid", "kernel"),
     )
 
@@ -65,9 +65,9 @@ class IBS(SequentialIBS):
     name = "ibs"
     needs = (("estimator", "kernel".__ne__, "floor_is_relative cells recent"),)
 
-    floor: float = option(0.002, "lowest weight of a goal, as a share of the largest q*", at_least=0)
+    floor: float = option(0.002, "lowest weight of a goal, as a fraction of the largest q*", at_least=0)
     floor_is_relative: bool = option(
-        True, "whether floor is such a share; if false, it is compared with q* - q as it is (the thesis)"
+        True, "whether floor is a fraction of the largest q*; if false, floor is the lowest weight itself"
     )
 
 
@@ -75,7 +75,7 @@ class IBS(SequentialIBS):
 class _Novelty(Weights):
     sharpness: float | None = option(
         None,
-        "exponent of the weights; the default is 1, and 3 / g for rare goals of g numbers, if g is above 3",
+        "exponent of the weights; default: 1, or 3 / g with weights=rare if goals have g > 3 coordinates",
         above=0,
     )
 
@@ -87,7 +87,7 @@ class Rare(_Novelty):
     name = "rare"
     maker = f"{_MAKERS}:make_rare"
 
-    memory: int = option(10_000, "virtual goals among which others are rare, the newest ones", at_least=1)
+    memory: int = option(10_000, "number of newest virtual goals that rarity is judged by", at_least=1)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,1 +1,1 @@
-"""Searches for good options: their settings, and the options that they vary."""
+"""Settings of searches for good options, and search spaces: the options that a search varies."""

@@ -1,4 +1,4 @@
-"""Settings of a search for good options: the recipe, the options that vary, and the sampler."""
+"""Settings of a search for good options: its recipe, search space, sampler and pruner."""
 
 from __future__ import annotations
 
@@ -20,18 +20,19 @@ PRUNERS: tuple[str, ...] = get_args(Pruner)
 
 @dataclass(frozen=True, kw_only=True)
 class Search:
-    """A search for good options.
+    """Settings of a search for good options.
 
     Args:
-        recipe: recipe of the trials, except for the options that are varied. Each trial trains its
-            ``num_runs`` runs, from its ``seed`` on; the sampler of options uses this seed, too.
-        space: the options that are varied.
-        sampler: ``tpe``, ``random`` or ``cmaes``.
-        pruner: rule that ends trials early. ``median`` ends those below the median of the others at the same
-            epoch; ``halving`` all but the best third at a ninth and at a third of the epochs; or ``none``.
+        recipe: recipe of the trials, except for the options that are varied. Each trial trains ``num_runs``
+            runs with the seeds from ``seed`` on. The sampler of options uses ``seed``, too.
+        space: the options that are varied, with their ranges.
+        sampler: method that chooses options of trials: ``tpe``, ``random`` or ``cmaes``.
+        pruner: rule that ends trials early. ``median`` ends a trial if it is below the median of the other
+            trials at the same epoch. ``halving`` ends all but the best third at a ninth and at a third of
+            the epochs. ``none`` ends no trial.
 
     Raises:
-        ValueError: an unknown sampler or pruner, or a space that the recipe does not take.
+        ValueError: the sampler or pruner is unknown, or the recipe does not accept the ranges of the space.
 
     Example:
         >>> from torchrl_her_recipes import make_recipe, space_for
@@ -52,8 +53,8 @@ class Search:
         numbers = [name for name, values in self.space.ranges.items() if values["kind"] != "choice"]
         if self.sampler == "cmaes" and len(numbers) < 2:
             raise ValueError(
-                f"--sampler cmaes needs two options that are no choices, and the space {self.space.name} "
-                "has fewer: take tpe or random"
+                f"--sampler cmaes needs at least two numeric options, but the space {self.space.name} has "
+                "fewer: choose tpe or random"
             )
         self.space.check(self.recipe)
         values = self.space.values_of(self.recipe)
@@ -66,7 +67,7 @@ class Search:
                 )
 
     def to_plain(self) -> dict[str, Any]:
-        """Returns the search as plain values, as they are written into the folder of the search."""
+        """Returns the settings as plain values, which are written into the folder of the search."""
         return {
             "sampler": self.sampler,
             "pruner": self.pruner,
@@ -76,7 +77,7 @@ class Search:
 
 
 def difference(search: Mapping[str, Any], other: Mapping[str, Any]) -> str:
-    """Compares two searches, given as plain values: ``mine, not theirs``, or an empty text if they are equal.
+    """Describes the first difference between two searches, given as plain values; empty if they are equal.
 
     Example:
         >>> from torchrl_her_recipes import make_recipe, space_for

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 _RANGE = ("low", "high")
 _KINDS = {"float": _RANGE, "log_float": _RANGE, "int": _RANGE, "log_int": _RANGE, "choice": ("values",)}
-_MOST = 100  # largest number of values of a choice
+_MOST = 100  # largest number of values in a range of kind "choice"
 _LARGEST = 1e15
 # Options that cannot vary: trials must have the same length and start to be compared.
 _SAME_FOR_ALL = ("task", "seed", "num_runs", "epochs", "epoch_frames", "checkpoint_interval", "keep_buffer")
@@ -31,19 +31,19 @@ _SAME_FOR_ALL = ("task", "seed", "num_runs", "epochs", "epoch_frames", "checkpoi
 class Space:
     """Search space: the options that a search varies, and their ranges.
 
-    With Optuna itself::
+    A space can also be used in a loop over Optuna's own study::
 
         trial = study.ask(space.distributions())
         study.tell(trial, run_score(space.recipe(recipe, trial.params)))
 
     Args:
         name: Name of the space in messages.
-        ranges: Range of each option by its name, short or with its group: ``{kind: float, low: 0, high: 1}``,
-            where ``kind`` may also be ``int``, ``log_float`` or ``log_int``, or
-            ``{kind: choice, values: [64, 128]}``.
+        ranges: Range of each option, by the option's name (short, or with its group). A range of numbers is
+            ``{kind: float, low: 0, high: 1}``, with the kinds ``float``, ``int``, ``log_float`` and
+            ``log_int``; other values are ``{kind: choice, values: [relu, tanh]}``.
 
     Raises:
-        ValueError: an unknown option or kind, an empty range, or two ranges for one option.
+        ValueError: an option or kind is unknown, a range is empty, or an option has two ranges.
     """
 
     name: str
@@ -53,7 +53,7 @@ class Space:
         if not isinstance(self.ranges, Mapping) or not all(isinstance(name, str) for name in self.ranges):
             raise ValueError(f"the space {self.name} must hold options by name, got {shown(self.ranges)}")
         if not self.ranges:
-            raise ValueError(f"the space {self.name} varies nothing")
+            raise ValueError(f"the space {self.name} has no options to vary")
         checked = {name: _checked(name, values) for name, values in self.ranges.items()}
         places = [locate(name) for name in checked]
         for home, name in zip(places, checked, strict=True):
@@ -66,7 +66,7 @@ class Space:
         return {name: _distribution(**values) for name, values in self.ranges.items()}
 
     def without(self, names: Mapping[str, Any]) -> Space:
-        """Returns the space without options whose values are given.
+        """Returns a copy of the space without the named options, whose values are given.
 
         Raises:
             ValueError: no option is left.
@@ -81,10 +81,10 @@ class Space:
         return replace(self, ranges=left)
 
     def check(self, recipe: Recipe) -> None:
-        """Checks that a recipe accepts the ends of all ranges, and all values of choices.
+        """Checks that a recipe accepts both ends of each range, and each value of each choice.
 
         Raises:
-            ValueError: the recipe refuses such a value; the message names the option.
+            ValueError: the recipe does not accept a value; the message names the option.
         """
         for name, values in self.ranges.items():
             for value in values.get("values") or (values["low"], values["high"]):
@@ -94,20 +94,20 @@ class Space:
                     raise ValueError(f"the space {self.name} does not fit: {error}") from error
 
     def recipe(self, base: Recipe, values: Mapping[str, Any]) -> Recipe:
-        """Makes a recipe with given values of the options that are varied.
+        """Returns a copy of ``base`` with the given values of varied options.
 
-        A value that has no effect beside the others is left out. ``k`` and ``strategy`` replace
-        ``goal_sources``.
+        A value that has no effect together with the others is left out. ``k`` and ``strategy`` replace
+        the ``goal_sources`` of ``base``.
 
         Raises:
-            ValueError: values that cannot go together.
+            ValueError: the values cannot be used together.
         """
         given = place(values, base.to_dict())
         drop_alternatives({}, given)
         return compose(merge(base.to_dict(), given), {})
 
     def values_of(self, recipe: Recipe) -> dict[str, Any]:
-        """Returns a recipe's values of the varied options that have an effect, even if outside the ranges."""
+        """Returns the values that a recipe has for the varied options, except options without effect."""
         idle = without_effect(recipe)
         places = {name: locate(name, recipe.to_dict()) for name in self.ranges}
         return {
@@ -127,7 +127,7 @@ class Space:
 
 
 def _checked(name: str, values: Any) -> dict[str, Any]:
-    """Returns the range of an option, with numbers in place of text such as ``1e-4``."""
+    """Checks the range of an option and returns it, with text such as ``1e-4`` converted to numbers."""
     if (home := locate(name))[1] in _SAME_FOR_ALL or home == ("task", "name"):
         raise ValueError(f"{name} must be the same in all trials of a search: it cannot be varied")
     if not isinstance(values, Mapping) or "kind" not in values:
@@ -180,20 +180,20 @@ def space_names() -> list[str]:
 
 
 def space_summary(name: str) -> str:
-    """Returns the options that a space varies, in one line, shortened if need be."""
+    """Returns the names of the options that a space varies, in one line of at most 85 characters."""
     return shorten(", ".join(load_space(name).ranges), 85, placeholder=" ...")
 
 
 def load_space(name: str) -> Space:
-    """Loads a space by its name, or from a file.
+    """Loads a search space by its name, or from a file.
 
     Args:
-        name: one of ``space_names()``, or the path of a YAML file with a mapping of options by name:
-            ``learning_rate: {kind: log_float, low: 1e-4, high: 1e-2}``, or
+        name: one of ``space_names()``, or the path of a YAML file that maps names of options to ranges, as in
+            ``learning_rate: {kind: log_float, low: 1e-4, high: 1e-2}`` or
             ``hidden: {kind: choice, values: [64, 128]}``.
 
     Raises:
-        ValueError: there is no such space, or the file holds no space; the message is one line.
+        ValueError: no space has this name, or the file does not hold a space; the message is one line.
         OSError: the file cannot be read.
 
     Example:
@@ -204,7 +204,7 @@ def load_space(name: str) -> Space:
 
 
 def space_for(recipe: Recipe) -> Space:
-    """Returns the space of a recipe's learner, without options that have no effect.
+    """Returns the package's search space for a recipe's learner, without options that have no effect.
 
     Raises:
         ValueError: the package has no search space for the learner.
@@ -213,7 +213,7 @@ def space_for(recipe: Recipe) -> Space:
     learner = BY_ACTIONS[actions] if recipe.learner.name == "auto" else recipe.learner.name
     if learner not in space_names():
         known = ", ".join(space_names())
-        raise ValueError(f"learner={learner} has no space of its own ({known} have): give one, --space FILE")
+        raise ValueError(f"there is a search space for {known}, not for {learner}: give --space FILE")
     space, idle = load_space(learner), without_effect(recipe)
     left = {name: values for name, values in space.ranges.items() if locate(name) not in idle}
     return replace(space, ranges=left)

@@ -1,1 +1,1 @@
-"""Opens TorchRL's loggers for ``log=NAME``, so that resumed runs continue in them, and logs runs to them."""
+"""Opens TorchRL's loggers for ``log=NAME``, in a way that resumed runs continue them, and logs runs."""

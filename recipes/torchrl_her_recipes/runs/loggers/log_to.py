@@ -1,4 +1,4 @@
-"""Passes a run's options, the rows of its table and its pictures to loggers of TorchRL."""
+"""Callbacks that pass a run's options, metrics and pictures to TorchRL's loggers."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ _OF_A_ROW = ("run", "seed")  # columns that identify a row and are not logged as
 
 
 class LogTo(Callback):
-    """Logs a run to one of TorchRL's loggers.
+    """Callback that logs a run to one of TorchRL's loggers.
 
-    Logs the options at the start, and the pictures and the video at the end. After each evaluation, logs the
-    new row of the table of metrics, with its number of frames as the step. Metrics are named
-    ``success/run_0``, for each run. The caller closes the logger.
+    It logs the options at the start, new rows of the table of metrics after each evaluation, and the pictures
+    and the video at the end. The step is the number of frames. A metric's name contains the index of the run,
+    as in ``success/run_0``. The caller closes the logger.
 
-    When a run resumes, all rows so far are logged first, since the logger may be a new one.
+    When a run is resumed, all earlier rows are logged first, since the logger may be a new one.
 
     Args:
-        logger: a logger of TorchRL's, or one of your own.
+        logger: any TorchRL ``Logger``.
 
     Keyword Args:
-        after: number of frames up to which rows are left out, because the logger has them.
+        after: number of frames up to which rows are not logged, because the logger already has them.
 
     Example:
         >>> from tempfile import TemporaryDirectory
@@ -55,7 +55,7 @@ class LogTo(Callback):
         self._told = after
 
     def on_start(self, run: RunView) -> None:
-        """Logs the options, and all rows so far."""
+        """Logs the options, and all earlier rows of a resumed run."""
         self._told = self.after
         self.logger.log_hparams(flat(run.components.recipe.to_dict()))
         self._tell(run.rows)
@@ -65,7 +65,7 @@ class LogTo(Callback):
         self._tell(run.rows)
 
     def on_end(self, run: RunView) -> None:
-        """Logs the run's pictures."""
+        """Logs the run's pictures and its video."""
         if run.folder is not None:
             for path in (run.folder.curves, run.folder.goals, run.folder.video):
                 if path.exists():
@@ -83,14 +83,14 @@ class LogTo(Callback):
             }
             self.logger.log_metrics(metrics, step=frames)
             self._told = frames
-        self.logger.flush()  # rows before a checkpoint must be there when the run resumes from it
+        self.logger.flush()  # a run resumed from the next checkpoint expects these rows in the logger
 
 
 class LogByName(Callback):
-    """Callback of ``log=NAME``: opens or resumes a logger in the run's folder. The run closes it.
+    """Callback of ``log=NAME``: opens a logger in the run's folder, or continues an earlier one.
 
-    A logger that fails does not end the run: it is opened again after the next epoch, and gets the rows that
-    it has missed.
+    The run closes the logger. A logger that fails does not end the run: it is opened again after the next
+    epoch, and then receives the rows that it missed.
     """
 
     def __init__(self, name: str) -> None:
@@ -102,7 +102,7 @@ class LogByName(Callback):
         self._kept = run.trainer.frames
         try:
             self._opened(run)
-        except Exception as error:  # a service may raise any error
+        except Exception as error:  # logging services raise errors of any type
             self.close()
             raise ValueError(f"log={self.name} cannot begin: {_reason(error)}") from error
 
@@ -125,7 +125,7 @@ class LogByName(Callback):
                 warnings.warn(f"log={self.name} was not closed: {_reason(error)}", stacklevel=2)
 
     def _opened(self, run: RunView) -> LogTo:
-        """Returns the logger; if it is not open, opens it first and logs the rows so far."""
+        """Returns the logger; if it is not open, first opens it and logs earlier rows."""
         if self._teller is None:
             logger, known = load_name(LOGGERS[self.name].factory)(run, self._kept)
             self._teller = LogTo(logger, after=known)
@@ -135,7 +135,7 @@ class LogByName(Callback):
     def _tried(self, call: Callable[[], None], run: RunView) -> bool:
         try:
             call()
-        except Exception as error:  # a full disk, a network that is down
+        except Exception as error:  # a full disk, no network, ...: training must continue
             after = f"after {run.trainer.frames:,} frames"
             warnings.warn(f"log={self.name} fails {after}, the run continues: {_reason(error)}", stacklevel=2)
             self.close()
@@ -163,13 +163,13 @@ def flat(groups: Mapping[str, Mapping[str, Any]]) -> dict[str, bool | int | floa
 
 @singledispatch
 def show_file(logger: Logger, name: str, path: Path, step: int) -> None:
-    """Passes a picture (``.png``) or a video (``.gif``) to a logger; does nothing if it takes no such files.
+    """Passes a picture (``.png``) or a video (``.gif``) to a logger.
 
-    A logger of your own gets videos through its method ``log_video``. To pass pictures to it, register a
-    function for its class with ``@show_file.register``.
+    For classes of loggers that have no function below, videos are passed to ``log_video``, and pictures are
+    not logged. To change this for your own class, register a function for it with ``@show_file.register``.
 
     Args:
-        logger: logger that gets the file.
+        logger: logger that receives the file.
         name: name of the picture or video in the logger.
         path: path of the file.
         step: number of frames at which the file was made.
@@ -180,7 +180,7 @@ def show_file(logger: Logger, name: str, path: Path, step: int) -> None:
 
 @show_file.register
 def _(logger: CSVLogger, name: str, path: Path, step: int) -> None:
-    """Does nothing: tables have no pictures."""
+    """Does nothing: CSV files cannot hold pictures."""
 
 
 @show_file.register
@@ -203,12 +203,12 @@ def _(logger: WandbLogger, name: str, path: Path, step: int) -> None:
 def _(logger: MLFlowLogger, _name: str, path: Path, _step: int) -> None:
     from mlflow import MlflowClient  # noqa: PLC0415  (an extra)
 
-    client = MlflowClient(logger.log_dir)  # TorchRL stores the address of the service there
+    client = MlflowClient(logger.log_dir)  # TorchRL stores the address of the MLflow server in ``log_dir``
     client.log_artifact(logger.experiment.info.run_id, str(path), "pictures")
 
 
 def read_film(path: Path) -> torch.Tensor:
-    """Reads the frames of a GIF for TorchRL's loggers, [1, T, 3, H, W] of uint8."""
+    """Reads the frames of a GIF; returns [1, T, 3, H, W] of uint8, as TorchRL's loggers need them."""
     with Image.open(path) as film:
         frames = [np.asarray(frame.convert("RGB")) for frame in ImageSequence.Iterator(film)]
     return torch.from_numpy(np.stack(frames)).permute(0, 3, 1, 2).unsqueeze(0)

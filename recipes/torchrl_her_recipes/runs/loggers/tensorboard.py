@@ -1,4 +1,4 @@
-"""``log=tensorboard``: TorchRL's ``TensorboardLogger``, which can resume after a kill."""
+"""``log=tensorboard``: TorchRL's ``TensorboardLogger``, extended so that killed runs can be resumed."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from torchrl.record.loggers import TensorboardLogger
 from torchrl_her_recipes.runs.callbacks import RunView
 
 _NAME = "tensorboard"
-_PATIENCE = 3  # seconds; does not wait if the clock was set back by more
+_PATIENCE = 3  # longest wait in seconds, in case the clock was set back
 
 
 class TensorboardEvents(TensorboardLogger):
-    """Writes events of TensorBoard, after dropping earlier events from some step on.
+    """Logger that writes events of TensorBoard, and can drop earlier events from a given step on.
 
     Args:
         exp_name: name of the folder.
         log_dir: path of its parent folder.
 
     Keyword Args:
-        purge_step: step from which on earlier events are dropped; None keeps all events.
+        purge_step: step from which events of earlier files are dropped; None keeps all events.
     """
 
     def __init__(self, exp_name: str, log_dir: str, *, purge_step: int | None = None) -> None:
@@ -35,13 +35,13 @@ class TensorboardEvents(TensorboardLogger):
         return SummaryWriter(f"{self.log_dir}/{self.exp_name}", purge_step=self._purge_step)
 
     def log_hparams(self, cfg: dict[str, Any]) -> None:
-        """Writes options into the same events; TorchRL's method would make another folder at each start."""
+        """Logs options to the same file; TorchRL's method would make another folder at each start."""
         for summary in hparams(cfg, {}):
             self.experiment.file_writer.add_summary(summary)
 
 
 def open_tensorboard(run: RunView, frames: int) -> tuple[TensorboardEvents, int]:
-    """Opens a logger into ``tensorboard/`` of the run's folder; events behind ``frames`` are dropped."""
+    """Opens a logger in ``tensorboard/`` of the run's folder; drops events after ``frames`` frames."""
     assert run.folder is not None
     home = run.folder.path
     before = list((home / _NAME).glob("events.*"))
@@ -51,7 +51,7 @@ def open_tensorboard(run: RunView, frames: int) -> tuple[TensorboardEvents, int]
 
 
 def _wait_for_the_next_second(files: list[Path]) -> None:
-    """Waits until a new file sorts last: files are read by name, and names begin with the time in seconds."""
+    """Waits until a new file sorts after ``files``: names, which give the order, have the time in seconds."""
     newest = max(int(path.name.split(".")[3]) for path in files)
     while newest >= int(time.time()) > newest - _PATIENCE:
         time.sleep(0.05)

@@ -19,28 +19,28 @@ _PROJECT = "torchrl-her"
 
 
 class WandbRun(WandbLogger):
-    """Logger that counts frames as steps; TorchRL's has a counter for each group of metrics."""
+    """Logger whose steps are frames; TorchRL's own counts steps for each group of metrics separately."""
 
     def log_metrics(
         self, metrics: Mapping[str, Any], step: int | None = None, **_options: Any
     ) -> dict[str, Any]:
-        """Logs numbers, or pictures, of one step."""
+        """Logs numbers or pictures at a step, which is a number of frames."""
         return super().log_metrics(dict(metrics), step=step, override_global_step=True)
 
 
 def open_wandb(run: RunView, _frames: int) -> tuple[WandbRun, int]:
-    """Opens a logger into the project ``WANDB_PROJECT`` or ``torchrl-her``; a resumed run keeps its id.
+    """Opens a logger for the project ``WANDB_PROJECT``, by default ``torchrl-her``.
 
-    If W&B is offline (``WANDB_MODE=offline``), a resumed run logs its whole table of metrics to new files,
-    and earlier files are removed. If W&B is online, rows that it has cannot be deleted, so only later rows
-    are logged.
+    A resumed run keeps its id. If W&B is offline (``WANDB_MODE=offline``), the resumed run logs its whole
+    table of metrics to new files, and earlier files are removed. If W&B is online, rows that were logged
+    cannot be deleted, so only later rows are logged.
 
     Returns:
         The logger, and the number of frames up to which it already has rows.
     """
     assert run.folder is not None
     home = run.folder.path
-    settings = wandb.Settings(console="off", silent=True)  # the console belongs to this program
+    settings = wandb.Settings(console="off", silent=True)  # keeps wandb from printing to the terminal
     own_id = remembered(home / "wandb" / "run_id.txt")
     project = os.environ.get("WANDB_PROJECT", _PROJECT)
     try:
@@ -49,7 +49,7 @@ def open_wandb(run: RunView, _frames: int) -> tuple[WandbRun, int]:
             save_dir=str(home),
             id=own_id,
             project=project,
-            log_env_packages=False,  # run.json has the versions
+            log_env_packages=False,  # not needed: run.json has the versions of packages
             settings=settings,
             reinit="create_new",  # other runs may be open in this process
         )
@@ -63,14 +63,14 @@ def open_wandb(run: RunView, _frames: int) -> tuple[WandbRun, int]:
 
 
 def _remove_others(home: Path, current: Path) -> None:
-    """Removes earlier offline logs: the current one repeats their contents."""
+    """Removes earlier offline logs of the run, whose contents the current log repeats."""
     for folder in home.glob("offline-run-*"):
         if folder.resolve() != current.resolve():
             shutil.rmtree(folder, ignore_errors=True)
 
 
 def remembered(path: Path) -> str:
-    """Reads the id of a run from a file; makes and writes a new one if there is none."""
+    """Reads the id of a run from a file; if the file has none, makes a new id and writes it."""
     if path.is_file() and (run_id := path.read_text().strip()):
         return run_id
     run_id = uuid.uuid4().hex[:12]

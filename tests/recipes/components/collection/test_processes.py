@@ -173,8 +173,8 @@ def test_processes_are_guided_by_what_a_run_has_learned(apart: dict[str, Any]) -
 @pytest.mark.parametrize(
     ("name", "error"),
     [
-        ("breaks", "a process that collects has ended, and with it all others; its own error stands above"),
-        ("killed", "a process that collects has ended, and with it all others; its own error stands above"),
+        ("breaks", "a process that collects has failed, and all others were ended; the error of the process"),
+        ("killed", "a process that collects has failed, and all others were ended; the error of the process"),
         ("cannot start", "RuntimeError('a process that collects cannot start: there is no display')"),
     ],
 )
@@ -248,7 +248,7 @@ def test_a_script_that_its_processes_would_run_again_is_refused(tmp_path: Path) 
         "from torchrl_her_recipes import build, make_recipe, run\n"
         f"run(build(make_recipe(task='hand_v0', {sizes})), progress=False)\n"
     )
-    advice = "put what trains there under `if __name__ == '__main__':`"
+    advice = "put the code that trains under `if __name__ == '__main__':`"
     message = f"processes=2 starts processes that import {script}: {advice}"
     with pytest.raises(RuntimeError, match=f"^{re.escape(message)}$"):
         runpy.run_path(str(script), run_name="__main__")

@@ -79,7 +79,7 @@ def test_a_node_that_dies_costs_its_open_episodes_alone(
         return batch
 
     components.collector.next = next_batch  # type: ignore[method-assign]
-    with pytest.warns(UserWarning, match="process . of those that collect died, for the 1. time in this run"):
+    with pytest.warns(UserWarning, match="collecting process . died, time 1 in this run"):
         found = _ran(components)
     for rows, waiting in zip(found["rows"], found["held"], strict=True):
         shares = each_once(audit_run(rows))

@@ -84,7 +84,7 @@ def test_a_space_is_what_was_written(tmp_path: Path) -> None:
         ("", "must hold options by name, got None"),
         ("[1, 2]", r"must hold options by name, got \[1, 2\]"),
         ("1: {kind: float}", "must hold options by name, got {1: "),
-        ("{}", "varies nothing"),
+        ("{}", "has no options to vary"),
         ("a: [", "cannot be read: line 1: while parsing"),
         ("[" * 30_000, "cannot be read: it is nested more than 30 levels deep"),
         ("#" * 1_100_000, "cannot be read: it has more than 1,048,576 bytes"),
@@ -172,7 +172,7 @@ def test_what_the_recipe_does_not_take_is_refused(text: str, message: str, tmp_p
 def test_samplers_and_spaces_that_do_not_go_together() -> None:
     recipe = make_recipe(task="hand_v0")
     space = Space(name="mine", ranges={"k": {"kind": "int", "low": 1, "high": 4}})
-    with pytest.raises(ValueError, match="--sampler cmaes needs two options that are no choices"):
+    with pytest.raises(ValueError, match="--sampler cmaes needs at least two numeric options"):
         Search(recipe=recipe, space=space, sampler="cmaes")
     steps = Space(
         name="mine",
