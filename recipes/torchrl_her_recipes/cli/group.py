@@ -92,7 +92,7 @@ _may_import = click.option(
     is_flag=True,
     expose_value=False,
     callback=_permit,
-    help="allow modules to be imported that a file names by its task (module:function, gym:module:ID)",
+    help="allow the task in a file to import its module, if you trust it (module:function, gym:module:ID)",
 )
 
 for _command in (check, train, record, play, export, plot, study, report, tune):

@@ -29,7 +29,7 @@ def _complete(_context: click.Context, _parameter: click.Parameter, incomplete: 
 @click.option(
     "--plan", is_flag=True, help="only print the runs to do, with their time if some epochs are done"
 )
-@click.option("--jobs", type=click.IntRange(1), help="batches of seeds that train at once (default: cores)")
+@click.option("--jobs", type=click.IntRange(1), help="batches of seeds at once (default: one for each core)")
 @click.option("--ray", metavar="ADDRESS", help="train on a Ray cluster at this address: auto, or HOST:PORT")
 @click.option(
     "--gpus-per-job",

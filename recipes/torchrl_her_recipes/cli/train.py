@@ -25,7 +25,7 @@ from torchrl_her_recipes.config.resolve import auto_options
 
 @click.command(cls=OptionsCommand, short_help="train, or resume a run")
 @click.option("-m", "--multirun", is_flag=True, help="train a sweep: algo=her,cher seed=0,1 are four runs")
-@click.option("--jobs", type=click.IntRange(1), help="runs of a sweep that train at once (default: cores)")
+@click.option("--jobs", type=click.IntRange(1), help="runs of a sweep at once (default: one for each core)")
 @click.option(
     "--resume",
     metavar="RUN",

@@ -26,11 +26,13 @@ _SEEDS = 3  # default number of seeds that each trial trains
 
 
 @click.command(short_help="search for good options with Optuna, on all cores")
-@click.option("--trials", type=click.IntRange(1), help="total of trials (default: 50; none with --minutes)")
+@click.option(
+    "--trials", type=click.IntRange(1), help="number of trials (default: 50; no limit with --minutes)"
+)
 @click.option(
     "--minutes", type=click.FloatRange(0.0, min_open=True), help="minutes after which no further trial begins"
 )
-@click.option("--jobs", type=click.IntRange(1), help="trials that train at once (default: one per core)")
+@click.option("--jobs", type=click.IntRange(1), help="trials at once (default: one for each core)")
 @click.option(
     "--space",
     "space_name",

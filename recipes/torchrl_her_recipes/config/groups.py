@@ -47,8 +47,8 @@ class TaskConfig(Group):
     )
     failure: str = option(
         "never_pays",
-        "reward of a failure, as a fall: never_pays (the return of never achieving the goal), environment "
-        "(its own reward) or truncate (its own reward, and the episode is truncated, not terminated)",
+        "reward if an episode fails, as by a fall: never_pays (the return of never achieving the goal), "
+        "environment (the environment's reward) or truncate (the same, but the episode is truncated)",
         choices=("never_pays", "environment", "truncate"),
     )
 
@@ -72,12 +72,16 @@ class CollectionConfig(Group):
     needs: ClassVar[Needs] = (("processes", bool, "sync"),)
 
     epoch_frames: int = option(
-        AUTO, "environment steps in an epoch; auto: 100 episodes, or 4 per environment if batched", at_least=1
+        AUTO,
+        "environment steps in an epoch; auto: 100 episodes, or 4 per environment for this package's tasks",
+        at_least=1,
     )
     num_envs: int = option(
         AUTO, "environments that are stepped together; auto: 8, or 64 for this package's tasks", at_least=1
     )
-    steps_per_batch: int = option(10, "steps of each environment before gradient steps follow", at_least=1)
+    steps_per_batch: int = option(
+        10, "steps of each environment between two rounds of gradient steps", at_least=1
+    )
     frames_per_update: float = option(
         AUTO,
         "environment steps per gradient step; 0.5: two gradient steps per environment step; auto: 1, or 5 "
@@ -181,8 +185,7 @@ class HindsightConfig(Group):
     )
     refill: int = option(
         5,
-        "largest number of goals of a transition, in multiples of k; above 1, goals that the filter removes "
-        "are made up for at other transitions",
+        "if the filter leaves transitions without goals, others get more, up to this multiple of k",
         at_least=1,
     )
     redraw: bool = option(
@@ -279,7 +282,7 @@ class DemonstrationsConfig(Group):
     episodes: int = option(0, "number of demonstrations used, the first in the file; 0: none", at_least=0)
     file: str | None = option(None, "file of demonstrations, written by `torchrl-her record`")
     share: float = option(
-        0.125, "share of demonstrations in each batch; 0: only their states are used", at_least=0, below=1
+        0.125, "share of demonstrations in each batch; 0: use them only as starts", at_least=0, below=1
     )
     bc_weight: float = option(1.0, "weight of cloning demonstrations, in the actor's loss", at_least=0)
     q_filter: bool = option(True, "whether only actions are cloned that the critic prefers to the policy's")
@@ -296,7 +299,7 @@ class DemonstrationsConfig(Group):
     starts_threshold: float = option(
         0.5, "mean success of episodes with such starts at which starts move", above=0, at_most=1
     )
-    starts_samples: int = option(50, "episodes whose mean success starts_threshold is for", at_least=1)
+    starts_samples: int = option(50, "episodes whose mean is compared with starts_threshold", at_least=1)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -341,7 +344,7 @@ class RunConfig(Group):
     """Seeds, length and checkpoints of the runs."""
 
     seed: int = option(0, "seed of all random numbers", at_least=0)
-    num_runs: int = option(1, "number of runs trained at once; run i has the seed `seed + i`", at_least=1)
+    num_runs: int = option(1, "independent runs trained together; run i has the seed `seed + i`", at_least=1)
     epochs: int = option(30, "number of epochs; each ends with an evaluation", at_least=1)
     frames: int | None = option(
         None, "environment steps of each run, in place of epochs; rounded up to whole epochs", at_least=1
@@ -352,7 +355,7 @@ class RunConfig(Group):
         False, "whether the last checkpoint keeps the replay buffer, so that epochs can be added later"
     )
     pictures: bool = option(
-        True, "whether curves, a map of goals and a film of the policy are made at the end, within seconds"
+        True, "whether curves, a map of goals and a film of the policy are made at the end (takes seconds)"
     )
     log: Any = option(
         ("tensorboard",),

@@ -54,7 +54,7 @@ def advice(facts: Facts, recipe: Recipe, stages_file: str = "stages.yaml") -> li
         lines.append("entries of the observation are of very different scales: normalize=true")
     if facts.seconds > _SLOW and recipe.collection.processes == 0:
         lines.append(
-            f"an environment step takes {1e3 * facts.seconds:.0f} ms, longer than a gradient step: with "
+            f"a step takes {1e3 * facts.seconds:.0f} ms, longer than a gradient step: with "
             "processes=2, two processes collect while the main process learns"
         )
     if facts.achieved > _MOSTLY:

@@ -77,8 +77,8 @@ def test_another_task_is_refused_with_both_widths() -> None:
     robot = make_env("robot_v0")
     with pytest.raises(
         ValueError,
-        match=r"a policy of hand_v0 cannot play robot_v0: it has other widths, observation \[9\], "
-        r"desired_goal \[2\] and action \[3\], and robot_v0 has observation \[15\], desired_goal \[2\] "
+        match=r"a policy of hand_v0 cannot play robot_v0: the policy has observation \[9\], "
+        r"desired_goal \[2\] and action \[3\], but robot_v0 has observation \[15\], desired_goal \[2\] "
         r"and action \[3\]",
     ):
         load_policy("hand_v0").info.check_plays(robot, "robot_v0")

@@ -68,5 +68,5 @@ def test_a_page_that_somebody_wrote_is_not_replaced(tmp_path: Path) -> None:
     assert "It was trained on" not in text
     assert "torchrl-her export mine.safetensors --format onnx" in text
     page.write_text(text.split("\n", 1)[1])
-    with pytest.raises(ValueError, match="mine.md exists and is no model card that export wrote"):
+    with pytest.raises(ValueError, match="mine.md exists, and export did not write it"):
         check_free(page)

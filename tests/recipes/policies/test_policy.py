@@ -90,7 +90,9 @@ def test_export_takes_the_median_run(tmp_path: Path, capsys: pytest.CaptureFixtu
 def test_what_cannot_be_exported_is_said(tmp_path: Path) -> None:
     other = tmp_path / "other"
     run(build(small(task="hand_v0", epochs=1)), other, progress=False)
-    with pytest.raises(ValueError, match="a policy of hand_v0 cannot play robot_v0: it has other widths"):
+    with pytest.raises(
+        ValueError, match="a policy of hand_v0 cannot play robot_v0: the policy has observation"
+    ):
         export_policy(other, tmp_path / "policy.safetensors", task="robot_v0")
     with pytest.raises(ValueError, match="unknown task 'nope'"):
         export_policy(other, tmp_path / "policy.safetensors", task="nope")
@@ -207,7 +209,7 @@ def test_on_the_command_line(
         assert message in refused("export", *wrong)
     Path("a.md").write_text("mine")
     said = refused("export", "other.safetensors", "--out", "a.onnx")
-    assert "a.md exists and is no model card that export wrote" in said
+    assert "a.md exists, and export did not write it" in said
     assert sorted(path.name for path in tmp_path.iterdir()) == [
         "a.md", "hand_reach.md", "hand_reach.onnx", "other.safetensors"
     ]  # fmt: skip
@@ -274,7 +276,7 @@ def test_a_policy_that_no_longer_fits_its_task_is_not_played(
     robot = make_env("robot_v0", num_envs=2)
     monkeypatch.setattr(policy.TaskEnvs, "make", lambda *_args, **_options: robot)
     said = refused("play", "hand_reach", "--out", str(tmp_path / "a.gif"))
-    assert "a policy of hand_reach cannot play hand_reach: it has other widths" in said
+    assert "a policy of hand_reach cannot play hand_reach: the policy has observation" in said
 
 
 def test_predict_takes_what_gymnasium_shows() -> None:

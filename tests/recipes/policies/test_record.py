@@ -81,7 +81,7 @@ def test_environments_of_gymnasium_have_no_states(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("task", "options", "message"),
     [
-        ("bit_flip", {}, "bit_flip has no scripted controller: give --policy"),
+        ("bit_flip", {}, "bit_flip has no scripted controller: give another --policy"),
         ("bit_flip", {"policy": "hand_v1"}, "a policy of hand_v1 cannot play bit_flip"),
         ("hand_v9", {}, "unknown task 'hand_v9'; did you mean hand_v0"),
         ("hand_v1", {"policy": "nobody"}, "nobody is neither the folder of a run, nor the file"),

@@ -127,7 +127,7 @@ def test_in_a_curriculum_the_success_of_the_present_stage_counts() -> None:
 def test_values_that_no_return_can_have(q: float, bounds: tuple[float, float]) -> None:
     line = only(table(4, q=[0.0, q, q, q]), after=4, bounds=bounds)  # gamma=0.98: returns up to 50
     assert "the critic gives starts a mean value of " in line
-    assert "and returns are from " in line
+    assert "but returns are between " in line
     assert "clamp_targets" not in line  # it is on already
 
 

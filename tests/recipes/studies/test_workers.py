@@ -75,7 +75,7 @@ def test_a_process_that_dies_takes_only_its_job_along(
     wait_until(lambda: bool(workers.progress()), during=outcome)
     (process,) = set(active_children()) - before
     process.kill()
-    assert outcome.result().error == "its process was ended by SIGKILL, perhaps for want of memory"
+    assert outcome.result().error == "its process was ended by SIGKILL, perhaps because memory ran out"
     assert workers.progress() == {}
     assert set(active_children()) == before  # the next job gets a new one
 

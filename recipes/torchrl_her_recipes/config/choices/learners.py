@@ -23,9 +23,10 @@ def _norm(*more: str, text: str = "") -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class LearnerConfig(Choice):
-    """The learner and its networks. Its ``maker`` names a subclass of ``LearnerBuilder``.
+    """The learner and its networks.
 
     Attributes:
+        maker: name of a subclass of :class:`~torchrl_her_recipes.LearnerBuilder`.
         actions: kind of actions that the learner supports.
         stacks: whether several runs can be trained side by side in one program.
         priority_power: power of the absolute TD error that the loss writes as a transition's priority.
@@ -90,7 +91,7 @@ class LearnerConfig(Choice):
     )
     matmul_dtype: str = option(
         "float32",
-        "number type of products between hidden layers in compiled gradient steps; bfloat16 takes a third "
+        "dtype of matrix products between hidden layers in compiled gradient steps; bfloat16 takes a third "
         "less time at hidden=256 if the processor has AVX512-BF16, and more time otherwise",
         choices=("float32", "bfloat16"),
     )
