@@ -217,7 +217,7 @@ class SACConfig(_SomeCritics, EntropyConfig):
 @LEARNERS.register
 @dataclass(frozen=True, kw_only=True)
 class REDQConfig(SACConfig):
-    """SAC with ten critics, two of which, drawn at random, give the target (Chen et al., 2021)."""
+    """SAC with ten critics, of which each target uses two at random (Chen et al., 2021)."""
 
     name = "redq"
 
@@ -228,7 +228,7 @@ class REDQConfig(SACConfig):
 @LEARNERS.register
 @dataclass(frozen=True, kw_only=True)
 class TQCConfig(EntropyConfig):
-    """SAC whose critics predict quantiles; targets leave out the greatest (Kuznetsov et al., 2020)."""
+    """SAC with quantiles, the greatest of which targets leave out (Kuznetsov et al., 2020)."""
 
     name = "tqc"
     maker = f"{_MAKERS}:TQCBuilder"

@@ -26,7 +26,7 @@ WEIGHTS = Kind("weights", Weights, default="none")
 
 @dataclass(frozen=True, kw_only=True)
 class Equal(Weights):
-    """Equal weight for all goals; if their range is known, they are counted for the metric kl."""
+    """Equal weights; goals of a known range are counted for the metric kl."""
 
     name = "none"
     maker = f"{_MAKERS}:make_counts"
