@@ -143,7 +143,7 @@ def _beyond(learner: LearnerConfig, bounds: tuple[float, float], rows: Sequence[
         helps.insert(0, "clamp_targets=true")
     return (
         f"the critic gives starts a mean value of {last[-1]['q']:.4g}, but returns are between {low:.4g} and "
-        f"{high:.4g}: it diverges. What helps: {' or '.join(helps)}"
+        f"{high:.4g}: the critic diverges. What helps: {' or '.join(helps)}"
     )
 
 

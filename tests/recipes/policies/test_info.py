@@ -86,5 +86,5 @@ def test_another_task_is_refused_with_both_widths() -> None:
     own = {**describe_env(make_env("bit_flip", bits=4)), "task": "four"}
     four = card(**own)
     four.check_plays(make_env("bit_flip", bits=4), "four")
-    with pytest.raises(ValueError, match="action of 4 choices, and five has .* and action of 5 choices"):
+    with pytest.raises(ValueError, match="action of 4 choices, but five has .* and action of 5 choices"):
         four.check_plays(make_env("bit_flip", bits=5), "five")
