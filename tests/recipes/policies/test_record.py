@@ -85,7 +85,7 @@ def test_environments_of_gymnasium_have_no_states(tmp_path: Path) -> None:
         ("bit_flip", {"policy": "hand_v1"}, "a policy of hand_v1 cannot play bit_flip"),
         ("hand_v9", {}, "unknown task 'hand_v9'; did you mean hand_v0"),
         ("hand_v1", {"policy": "nobody"}, "nobody is neither the folder of a run, nor the file"),
-        ("hand_v1", {"policy": "robot_v1"}, "a policy of robot_v1 cannot play hand_v1: it has other widths"),
+        ("hand_v1", {"policy": "robot_v1"}, "a policy of robot_v1 cannot play hand_v1: the policy has"),
         ("hand_v1", {"episodes": 0}, "episodes must be at least 1, got 0"),
         (
             "hand_wall_v1",
