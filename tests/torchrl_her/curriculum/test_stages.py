@@ -213,13 +213,6 @@ def test_a_stage_ends_after_some_evaluations_at_the_latest() -> None:
     assert [again.record(poor).tolist() for _ in range(4)] == 4 * [[False, False]]  # the last one has no end
 
 
-def test_the_last_stage_has_no_end() -> None:
-    progress = make_progress(runs=2)
-    progress.set_stage(1, 2)
-    assert progress.record(torch.stack((flags("1111"), flags("1111")))).tolist() == [True, False]
-    assert progress.stages == (1, 2)
-
-
 def test_each_run_moves_on_by_itself() -> None:
     progress = make_progress(runs=3)
     moved = progress.record(torch.stack((flags("0000"), flags("1111"), flags("1100"))))

@@ -33,12 +33,6 @@ def test_interleaved_lanes_are_told_apart() -> None:
     assert left.tolist() == [5, 7, 8]
 
 
-def test_nothing_closed_is_no_episode() -> None:
-    episodes, left = find_episodes(torch.tensor([0, 0]), torch.tensor([False, False]))
-    assert len(episodes.lengths) == 0
-    assert left.tolist() == [0, 1]
-
-
 def test_no_rows_at_all() -> None:
     nothing = torch.empty(0, dtype=torch.int64)
     episodes, left = find_episodes(nothing, nothing.bool())

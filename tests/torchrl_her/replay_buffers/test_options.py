@@ -92,16 +92,6 @@ def test_relabeling_needs_the_flag_of_the_time_limit(make: Callable[..., Any]) -
 
 
 @both
-def test_an_object_and_keywords_relabel_alike(make: Callable[..., Any]) -> None:
-    options = {"k": 3, "strategy": "episode", "filter_achieved": True, "exclude": ["state", "action"]}
-    first, second = relabeled(make, **options), relabeled(make, HindsightOptions(**options))
-    keys = list(first.keys(True, True))
-    assert keys == list(second.keys(True, True))
-    assert all(torch.equal(first[key], second[key]) for key in keys)
-    assert "action" not in first.keys()
-
-
-@both
 def test_options_are_read_and_set_as_attributes(make: Callable[..., Any]) -> None:
     part = make(REWARD, k=2)
     part.k, part.strategy, part.filter_achieved, part.achieved_reward = 7, "final", True, 0.5

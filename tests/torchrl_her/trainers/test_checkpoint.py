@@ -97,13 +97,6 @@ def test_a_file_that_was_cut_short_is_noticed(whole: Path, part: float) -> None:
         load_checkpoint(short)
 
 
-def test_damage_in_the_body_is_called_damage(whole: Path) -> None:
-    damaged = whole.with_name("damaged.pt")
-    damaged.write_bytes(whole.read_bytes()[:-1] + b"!")
-    with pytest.raises(CheckpointError, match=r"damaged\.pt is damaged: its checksum does not match"):
-        load_checkpoint(damaged)
-
-
 def test_anything_else_behind_a_right_checksum_is_refused(whole: Path) -> None:
     strange, body = whole.with_name("strange.pt"), b"not torch's"
     strange.write_bytes(MARK + hashlib.sha256(body).digest() + body)
@@ -116,11 +109,6 @@ def test_other_files_are_no_checkpoints(tmp_path: Path) -> None:
     torch.save(STATE, path)
     with pytest.raises(CheckpointError, match=r"weights\.pt is not a checkpoint of torchrl-her"):
         load_checkpoint(path)
-
-
-def test_a_file_that_is_not_there_is_an_os_error(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match=r"missing\.pt"):
-        load_checkpoint(tmp_path / "missing.pt")
 
 
 class Harmful:
@@ -204,14 +192,6 @@ def test_the_old_checkpoint_is_whole_until_the_new_one_is_on_the_disk(
     assert seen == [({"epoch": 2}, {"epoch": 1})]
 
 
-def test_the_format_is_a_mark_a_checksum_and_torchs_file(whole: Path) -> None:
-    data = whole.read_bytes()
-    assert data.startswith(MARK)
-    body = data[len(MARK) + 32 :]
-    assert data[len(MARK) : len(MARK) + 32] == hashlib.sha256(body).digest()
-    assert torch.load(io.BytesIO(body), weights_only=True)["epoch"] == 3
-
-
 # The last ones
 
 
@@ -257,7 +237,8 @@ def test_none_that_is_whole_is_an_error(tmp_path: Path) -> None:
     path = saved(tmp_path, epochs=2)
     for file in tmp_path.iterdir():
         file.write_bytes(file.read_bytes()[:-1])
-    with pytest.raises(CheckpointError, match=r"checkpoint\.pt is damaged.*; .*checkpoint\.1\.pt is damaged"):
+    said = r"checkpoint\.pt is damaged: its checksum does not match; .*checkpoint\.1\.pt is damaged"
+    with pytest.raises(CheckpointError, match=said):
         load_newest_checkpoint(path)
 
 

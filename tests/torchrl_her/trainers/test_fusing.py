@@ -204,12 +204,6 @@ def test_widths_activations_and_normalizations() -> None:
     assert [own.norm for own in layers] == [Norm.LAYERNORM, Norm.LAYERNORM, Norm.PLAIN]
 
 
-def test_the_action_joins_behind_the_first_layer_of_a_critic() -> None:
-    layers = layers_of(CriticNet(5, 2, shape=NetworkShape(hidden=7)))
-    assert layers is not None
-    assert [own.joined for own in layers] == [0, 2, 0, 0]
-
-
 def test_the_input_of_a_critic_is_normalized_by_a_layer_without_inputs() -> None:
     layers = layers_of(CriticNet(5, 2, shape=NetworkShape(hidden=7, depth=2, norm="batch")))
     assert layers is not None

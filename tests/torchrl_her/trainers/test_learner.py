@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from copy import deepcopy
 from typing import Any
 
 import pytest
@@ -135,22 +134,6 @@ def test_other_losses_learn_as_well(kind: str, losses: set[str]) -> None:
         assert all(value.shape == (1, 1) and value.isfinite().all() for value in measured.values())
         assert data["td_error"].shape == (32,)
     assert all(not torch.equal(before[name], p) for name, p in loss.named_parameters())
-
-
-def test_several_steps_of_one_call_are_those_of_several_calls() -> None:
-    torch.manual_seed(0)
-    loss = constant_loss(-4.0, gamma=0.5)
-    together = LossLearner(loss, torch.optim.Adam(loss.parameters(), lr=0.1), SoftUpdate(loss, tau=0.5))
-    other = deepcopy(loss)
-    apart = LossLearner(other, torch.optim.Adam(other.parameters(), lr=0.1), SoftUpdate(other, tau=0.5))
-    data = rows([-1.0, 0.0, -1.0, -1.0], terminated=[0, 1, 0, 1])
-    halves = [data[:2].clone(), data[2:].clone()]
-    measured = together.update(data, 2)
-    losses = [apart.update(half)["loss_value"] for half in halves]
-    assert measured["loss_value"].tolist() == torch.cat(losses).tolist()
-    assert data["td_error"].tolist() == torch.cat([half["td_error"] for half in halves]).tolist()
-    for ours, theirs in zip(loss.parameters(), other.parameters(), strict=True):
-        assert torch.equal(ours, theirs)
 
 
 def test_each_network_is_clipped_by_itself_and_sacs_alpha_is_one() -> None:

@@ -8,9 +8,6 @@ from torch import nn
 
 from torchrl_her.trainers import clip_by_run
 
-# Most of these tests ask a loss for its numbers, and have no target networks to move.
-pytestmark = pytest.mark.filterwarnings("ignore:No target network updater has been associated")
-
 
 def test_clipping_by_run_is_clipping_each_run() -> None:
     gradients = [torch.randn(2, 3, 4), torch.randn(2, 1, 4)]

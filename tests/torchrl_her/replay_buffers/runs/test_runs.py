@@ -237,16 +237,6 @@ def test_one_run_is_the_case_of_one() -> None:
             assert same(plain.sample(8), buffer.sample(8))
 
 
-def test_rows_stay_in_their_block_when_it_is_full() -> None:
-    together = make_buffer(range(RUNS), capacity=23)
-    for batch in batches([[5] * 20] * (RUNS * ENVS), 6):
-        together.extend(batch)
-    assert sizes_of(together) == [23] * RUNS
-    for run in range(RUNS):
-        env = rows_of_run(together, run)["observation"][:, 0] // 1000
-        assert set(env.tolist()) <= {run * ENVS, run * ENVS + 1}
-
-
 def test_environments_are_known_by_ids_that_come_in_any_order() -> None:
     together, alone = make_both(filter_achieved=True)
     ids = torch.randperm(1_000, generator=torch.Generator().manual_seed(0))[: RUNS * ENVS]

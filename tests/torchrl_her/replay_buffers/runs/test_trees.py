@@ -105,25 +105,6 @@ def test_leaves_of_zero_are_never_drawn_whatever_the_rounding() -> None:
     assert (leaf % 37 == 0).all()
 
 
-def test_frequencies_are_the_shares() -> None:
-    values = torch.tensor([[1.0, 2.0, 3.0, 4.0], [0.0, 9.0, 0.0, 1.0]])
-    u = torch.rand(2, 200_000, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    leaf, _ = filled(values).draw(u)
-    shares = torch.stack([own.bincount(minlength=4) / 200_000 for own in leaf])
-    torch.testing.assert_close(shares, values / 10, atol=0.005, rtol=0)
-
-
-def test_a_run_s_draws_do_not_depend_on_the_others() -> None:
-    generator = torch.Generator().manual_seed(0)
-    values = torch.rand(3, 700, generator=generator)
-    u = torch.rand(3, 50, dtype=torch.float64, generator=generator)
-    together = filled(values).draw(u)
-    for run in range(3):
-        alone = filled(values[run : run + 1]).draw(u[run : run + 1])
-        for own, single in zip(together, alone, strict=True):
-            assert torch.equal(own[run], single[0])
-
-
 def test_clearing_a_run_leaves_the_others() -> None:
     values = torch.rand(3, 100, generator=torch.Generator().manual_seed(0))
     trees = filled(values)
