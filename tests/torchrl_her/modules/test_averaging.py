@@ -42,19 +42,6 @@ def test_by_hand() -> None:
     assert weight_of(average) == pytest.approx(1 + 2 * 0.75)
 
 
-def test_several_steps_at_once_are_as_many_with_the_same_weights() -> None:
-    policies = [make_policy(1.0) for _ in range(2)]
-    one, other = (PolicyAverage(policy, decay=0.9) for policy in policies)
-    for average in (one, other):
-        average.steps.fill_(1_000)
-    for policy in policies:
-        set_weight(policy, 2.0)
-    one.follow(7)
-    for _ in range(7):
-        other.follow()
-    assert weight_of(one) == pytest.approx(weight_of(other))
-
-
 def test_the_policy_and_its_gradients_are_left_alone() -> None:
     actor = make_actor((4, 2), 3)
     average = PolicyAverage(actor)

@@ -37,10 +37,6 @@ def test_gamma_is_the_one_that_was_given(gamma: float, expected: float) -> None:
     assert loss(rows([-1.0]))["target_value"].item() == pytest.approx(expected)
 
 
-def test_gamma_is_098_by_default() -> None:
-    assert constant_loss(-10.0)(rows([-1.0]))["target_value"].item() == pytest.approx(-10.8)
-
-
 def test_targets_are_clamped_to_what_is_possible() -> None:
     assert constant_loss(-200.0)(rows([-1.0]))["target_value"].item() == pytest.approx(-50.0)
     assert constant_loss(100.0)(rows([-1.0]))["target_value"].item() == 0.0
