@@ -1,1 +1,1 @@
-"""Toy environments: bit flipping, treasure hunt, chain."""
+"""Toy environments: bit flipping, treasure hunt, chain, and a puck with momentum."""

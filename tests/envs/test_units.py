@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from torchrl_her_envs import make_env
-from torchrl_her_recipes.studies.units import in_units
+from torchrl_her_envs.units import in_units
 
 
 @pytest.mark.parametrize("task", ["hand_v1", "gym:torchrl_her_envs:torchrl_her/HandReach-v0"])

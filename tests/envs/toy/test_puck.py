@@ -6,7 +6,7 @@ import torch
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_her_envs import make_env
-from torchrl_her_recipes.studies.puck import Puck
+from torchrl_her_envs.toy.puck import Puck
 
 
 def test_specs_hold() -> None:
@@ -23,7 +23,7 @@ def test_it_slides_on_by_itself_and_stops_at_the_edge() -> None:
 
 
 def test_nothing_ends_an_episode_at_its_goal() -> None:
-    env = make_env("torchrl_her_recipes.studies.puck:Puck", num_envs=4, seed=[1, 2], termination="never")
+    env = make_env("torchrl_her_envs.toy.puck:Puck", num_envs=4, seed=[1, 2], termination="never")
     shown = env.reset()
     inner = env._envs[0]
     inner.place, inner.velocity = inner.goal.clone(), torch.zeros(4, 2)

@@ -10,8 +10,8 @@ from torch import Tensor
 from torchrl.data import Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from torchrl_her_envs import make_env
 from torchrl_her_envs.common.goal_env import GoalEnv, goal_env
+from torchrl_her_envs.registry import make_env
 
 _LENGTHS = ("observation", "achieved_goal", "desired_goal")
 
