@@ -14,10 +14,10 @@ _ROLES = ("`HERWriter`", '`HERWriter(per="episode")`', "`HERSampleUnit`")
 
 _TOP = """# Which parts of TorchRL go together
 
-Beside another part of TorchRL, `HERWriter` and `HERSampleUnit` either work, or raise an error that names the
-reason. The tests try each cell of the two tables below. In their environment, observations contain the run,
-environment, episode and step. So each transition of a buffer, or of a sampled batch, is compared with the
-collected one.
+Combined with another part of TorchRL, `HERWriter` and `HERSampleUnit` either work, or raise an error that
+names the reason. The tests try each cell of the two tables below. Observations of the test environment
+contain the run, environment, episode and step, so that each transition of a buffer, or of a sampled batch,
+can be compared with the collected one.
 
 - **yes**: all transitions were right. Each virtual goal was achieved in the same episode, and not before the
   transition; rewards and ends fit it; no real transition is lost or stored twice. Sequences drawn by samplers
@@ -34,7 +34,7 @@ go into a storage with `ndim=2`, called [T, N] here. With `replay_buffer=` the c
 
 Each cell was tried in three ways: with trajectory ids, which collectors write by default; with the ids of the
 transform [`EnvIds`](replay_buffers.md), too; and without ids. A cell that does not mention ids is the same in
-all three. If worker processes write by themselves, this is refused with any ids.
+all three. Worker processes that write into the buffer themselves are refused in all three.
 
 """
 
