@@ -130,7 +130,7 @@ class EnvReward:
         *,
         info_keys: Sequence[NestedKey] = (),
     ) -> None:
-        if isinstance(info_keys, str):  # its letters would be taken for keys
+        if isinstance(info_keys, str):  # each character would be taken for a key
             raise TypeError(f"info_keys must be a list, got {info_keys!r}: write [{info_keys!r}]")
         self.compute_reward = compute_reward
         self.compute_terminated = compute_terminated

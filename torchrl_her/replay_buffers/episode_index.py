@@ -51,7 +51,7 @@ class EpisodeIndex:
         return (position % self.slots + self.oldest) % self.slots * self.streams + position // self.slots
 
     def episode(self, place: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns the first place of the episode of each place [...], and one more than its last place."""
+        """Returns the first place, and the last place + 1, of the episode that contains each place [...]."""
         episode = torch.searchsorted(self.first, place, right=True) - 1
         return self.first[episode], self.first[episode + 1]
 

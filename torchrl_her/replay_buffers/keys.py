@@ -157,7 +157,7 @@ def in_root_and_next(keys: Sequence[NestedKey]) -> list[NestedKey]:
         >>> in_root_and_next(["state"])
         ['state', ('next', 'state')]
     """
-    if isinstance(keys, str):  # its letters would be taken for keys
+    if isinstance(keys, str):  # each character would be taken for a key
         raise TypeError(f"keys must be given as a list, got {keys!r}: write [{keys!r}]")
     return [twin for key in keys for twin in (unravel_key(key), under_next(key))]
 

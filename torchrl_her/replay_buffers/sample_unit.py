@@ -282,7 +282,8 @@ class HERSampleUnit(HindsightBase, SampleUnit):
         return out
 
     def __getstate__(self) -> dict[str, Any]:
-        # No generator, as in TorchRL, since none can be copied to another process; the storage is read again.
+        # Leaves out the generator, as TorchRL does: it cannot be copied to another process. The copy reads
+        # the storage again.
         return {**self.__dict__, "generator": None, "_stored": None}
 
     # Helpers

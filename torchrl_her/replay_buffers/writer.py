@@ -500,7 +500,7 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
                     goals = draft.virtual.changes[self._keys.goals[0]]
                     self._weights_of_runs().update(goals, draft.runs, draft.virtual.counts)
             for place, draft in enumerate(drafts):
-                # Not all at once unless ``on_write`` needs them: that would touch fresh memory.
+                # Without ``on_write``, drafts are joined one by one: all at once would touch fresh memory.
                 self._store(joined[place] if joined else join(draft), draft.runs, draft.counts)
                 for run, added in zip(draft.runs, draft.numbers, strict=True):
                     for written in (self._counts, self._totals):

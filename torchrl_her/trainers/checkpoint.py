@@ -114,7 +114,7 @@ def _write(state: dict[str, Any], file: BinaryIO) -> None:
     file.write(_MAGIC.ljust(_BODY, b"\0"))
     stream = _Stream(file)
     try:
-        # Without torch's own checksum, which would add half of the time of ours.
+        # Turns off torch's own checksum, which would add half of the time of ours.
         with config.patch("save.compute_crc32", False):  # type: ignore[attr-defined]
             torch.save(state, stream)  # type: ignore[arg-type]
     except RuntimeError as error:

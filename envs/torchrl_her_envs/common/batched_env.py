@@ -78,7 +78,7 @@ class BatchedEnv(GoalEnv):
         """Returns whether each environment is at its goal, as bool [N, 1]."""
         return self.compute_terminated(entries["achieved_goal"], entries["desired_goal"])
 
-    # Methods that subclasses inherit
+    # Public methods, and their checks
 
     def compute_reward(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:
         """Computes the reward of having achieved one goal when another was desired.
@@ -154,7 +154,7 @@ class BatchedEnv(GoalEnv):
         chosen = which.tolist()
         if len(set(chosen)) < len(chosen) or not all(0 <= index < self.batch_size[0] for index in chosen):
             raise ValueError(
-                f"which must be different environments from 0 to {self.batch_size[0] - 1}, got {chosen}"
+                f"'which' must hold distinct indices from 0 to {self.batch_size[0] - 1}, got {chosen}"
             )
         for name in entries:
             if name not in states:

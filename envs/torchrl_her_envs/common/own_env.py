@@ -116,7 +116,7 @@ def make_own_env(
         block_keys(seed, count)  # raises if they cannot be shared out
         share = count // len(seed)
         first = make_one(share, seed[0])
-        if callable(getattr(first, "set_seeds", None)):  # it takes several seeds
+        if callable(getattr(first, "set_seeds", None)):  # one object takes the seeds of all runs
             first.close()
             return [make_one(count, seed)]
         return [first, *(make_one(share, run_seed) for run_seed in seed[1:])]

@@ -111,7 +111,7 @@ def _register_robotics(id: str) -> str:
     """Registers the environments of gymnasium-robotics; returns a hint if they are not installed."""
     if ":" not in id and id not in gymnasium.registry:
         try:
-            with redirect_stderr(io.StringIO()):  # its notices are about environments without goals
+            with redirect_stderr(io.StringIO()):  # hides a notice about Adroit tasks, which have no goals
                 importlib.import_module("gymnasium_robotics")
         except ModuleNotFoundError:
             return " (gymnasium-robotics is not installed: pip install '.[robotics]')"

@@ -59,5 +59,5 @@ def within(dx: Any, dy: Any, distance: float) -> Any:
         >>> within(0.3, 0.4, 0.5), within(0.3, 0.4, 0.51)
         (False, True)
     """
-    # By coordinates: summing over a dimension of two takes several times as long.
+    # Adds the two coordinates itself: summing over a dimension of two takes several times as long.
     return dx * dx + dy * dy < distance**2

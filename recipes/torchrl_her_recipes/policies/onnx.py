@@ -143,7 +143,7 @@ def _silent() -> Iterator[None]:
     log.setLevel(logging.ERROR)  # suppresses a notice that torchvision is missing
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # they are about equal batch sizes and deprecated calls
+            warnings.simplefilter("ignore")  # warnings of equal batch sizes and deprecated calls
             yield
     finally:
         log.setLevel(level)

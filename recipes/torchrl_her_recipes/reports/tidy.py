@@ -177,7 +177,7 @@ def _write_table(cells: Sequence[Combination], out: Path) -> None:
                 writer.writerow([*head, *(_number(row.get(name)) for name in (*_KEYS, *metrics))])
     packed.unlink(missing_ok=True)
     if plain.stat().st_size > _LARGE:
-        # Without a time stamp, so that equal results give equal bytes.
+        # ``mtime=0`` leaves out the time stamp, so that equal results give equal bytes.
         packed.write_bytes(gzip.compress(plain.read_bytes(), mtime=0))
         plain.unlink()
 

@@ -120,7 +120,7 @@ class EarlyStopping(Callback):
         """
         last = sorted({row["epoch"] for row in rows})[-self.epochs :]
         if rows and not any(self.metric in row for row in rows) and rows[-1].get("updates", 1) > 0:
-            # Only after the first gradient step, since columns of losses are missing before.
+            # Raised only after the first gradient step, since columns of losses are missing before.
             raise ValueError(f"metric must be one of {', '.join(rows[-1])}, got {self.metric!r}")
         return len(last) == self.epochs and all(
             self._is_good([row.get(self.metric, math.nan) for row in rows if row["epoch"] == epoch])

@@ -41,7 +41,7 @@ def stage_success(
 def move_on(components: Components, state: CurriculumState, samples: Tensor, frames: int) -> list[str]:
     """Moves runs on whose success ``samples`` [R, n] end their stage; returns a message for each of them."""
     before, evaluations = state.progress.stages, state.progress.evaluations
-    # At most ``window`` samples, since more samples of one evaluation would make a lucky streak more likely.
+    # Records at most ``window`` samples: more samples of one evaluation make a lucky streak more likely.
     moved = state.progress.record(samples[:, : state.progress.window])
     learner, exploration, lines = components.recipe.learner, components.exploration, []
     for run in moved.nonzero().flatten().tolist():

@@ -73,7 +73,7 @@ def parts_of(components: Components, trainer: Trainer) -> dict[str, Any]:
             partial(buffer_state_dict, buffer, copy=False), partial(load_buffer_state_dict, buffer)
         ),
         "generators": Part(partial(generator_states, generators), partial(set_generator_states, generators)),
-        # For losses that draw random numbers from the global generators, such as SAC's.
+        # Some losses, such as SAC's, draw random numbers from the global generators.
         "torch_generator": Part(torch.get_rng_state, torch.set_rng_state),
         "cuda_generator": None
         if device.type != "cuda" or not torch.cuda.is_initialized()

@@ -85,7 +85,7 @@ def write_pictures(study: Study, folder: Path) -> None:
     if not study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)):
         return
     with warnings.catch_warnings(), rc_context():  # undoes the style that Optuna sets for the whole process
-        warnings.simplefilter("ignore")  # they say that figures are experimental, and concern limits of axes
+        warnings.simplefilter("ignore")  # warnings that figures are experimental, and of limits of axes
         drawn = {
             "history": figures.plot_optimization_history(study, target_name="score"),
             "options": figures.plot_slice(study, target_name="score"),

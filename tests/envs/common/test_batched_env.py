@@ -205,12 +205,12 @@ def test_episodes_start_at_given_states_and_the_others_go_on() -> None:
         (
             {"value": torch.zeros(2), "goal": torch.zeros(2)},
             [1, 1],
-            r"different environments from 0 to 1, got \[1, 1\]",
+            r"distinct indices from 0 to 1, got \[1, 1\]",
         ),
         (
             {"value": torch.zeros(1), "goal": torch.zeros(1)},
             [2],
-            r"different environments from 0 to 1, got \[2\]",
+            r"distinct indices from 0 to 1, got \[2\]",
         ),
     ],
 )

@@ -37,7 +37,7 @@ def test_another_choice_takes_those_options_of_a_base_that_it_has() -> None:
 def test_a_name_is_taken_once() -> None:
     kind = Kind("behavior", Behavior, default="real")
     assert kind.register(Real) is Real
-    with pytest.raises(ValueError, match="there is a behavior 'real' already"):
+    with pytest.raises(ValueError, match="behavior=real is registered already"):
         kind.register(Real)
 
 

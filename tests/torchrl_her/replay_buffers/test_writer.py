@@ -459,7 +459,7 @@ def test_another_trajectory_within_a_batch_is_refused_without_environment_ids() 
 
 @pytest.mark.parametrize("joined", [True, False])
 def test_environments_of_several_workers_are_told_apart_by_their_ids(joined: bool) -> None:
-    """In turns, as from an asynchronous collector, or one behind the other, as with cat_results=-1."""
+    """Batches arrive in turns, as from an asynchronous collector, or joined in time by cat_results=-1."""
     whole = with_env_ids(make_batch([[5, 3], [4, 4], [2, 6], [8]]))
     buffer = make_buffer(strategy="final", k=1)
     for start in range(0, 8, 2):

@@ -75,7 +75,7 @@ class RecentGoals:
                 number, goals, row = torch.ones_like(lengths), keys.asked_for(rows), episodes.rows[:, 0]
             else:
                 number, goals, row = lengths, achieved, episodes.rows[episodes.inside]
-            # In the dtype of achieved goals, which all virtual goals have.
+            # Goals are kept in the dtype of achieved goals, which all virtual goals have.
             new = stored_as(goals.index_select(0, row), achieved, keys.next_achieved)
             counts = [len(new)]
             if run is not None:

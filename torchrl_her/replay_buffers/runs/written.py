@@ -227,7 +227,7 @@ def take_rows(transitions: TensorDictBase, index: Tensor) -> TensorDictBase:
 
 
 def _take(entry: Any, index: Tensor) -> Any:
-    """Copies rows of an entry; rows of one number are flattened, since torch then indexes far faster."""
+    """Copies rows of an entry, which is flattened if a row is one number: torch then indexes far faster."""
     if not isinstance(entry, Tensor):
         return entry[index]
     if entry.shape[1:].numel() == 1:

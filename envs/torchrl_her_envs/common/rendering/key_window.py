@@ -107,7 +107,7 @@ class KeyWindow:
             if event.type == pygame.QUIT:
                 commands.append(Command.QUIT)
             elif event.type == pygame.KEYDOWN:
-                # On some keyboards plus is no key of its own, and only the typed letter shows it.
+                # On some keyboards plus has no key of its own: only the typed character identifies it.
                 typed = {"+": Command.FASTER, "-": Command.SLOWER}.get(getattr(event, "unicode", ""))
                 command = typed or self._commands.get(event.key)
                 commands += [] if command is None else [command]

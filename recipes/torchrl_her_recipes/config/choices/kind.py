@@ -52,7 +52,7 @@ class Kind(dict[str, type[C]]):
     def register(self, choice: type[C]) -> type[C]:
         """Class decorator that registers a choice under its ``name``."""
         if choice.name in self:
-            raise ValueError(f"there is a {self.section} {choice.name!r} already")
+            raise ValueError(f"{self.section}={choice.name} is registered already")
         self[choice.name] = choice
         return choice
 
