@@ -58,10 +58,10 @@ class Options:
     epochs: int = 30
     epoch_frames: int = 10_240
     num_envs: int = 64
-    steps_per_batch: int = 10  # steps of each environment between gradient steps
+    steps_per_batch: int = 10  # steps of each environment in a collected batch
     frames_per_update: int = 5
     warmup_frames: int = 3_200
-    episodes: int = 100  # episodes of an evaluation
+    episodes: int = 100  # number of episodes of an evaluation
     # Hindsight
     k: int = 4  # virtual goals per transition
     capacity: int = 1_000_000  # number of real and virtual transitions in the replay buffer

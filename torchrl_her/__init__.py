@@ -70,7 +70,7 @@ __all__ = [
 
 __version__ = version("torchrl-her")
 
-# Names that were here until 0.1, with the sub-packages that have them now. 0.2 drops these aliases.
+# Names that this package had until 0.1, and the sub-packages that have them now; 0.2 drops these aliases.
 _MOVED = {
     "DecayingEpsilonGreedy": "modules",
     "make_dqn_loss": "objectives",
@@ -83,7 +83,7 @@ _MOVED = {
     "sampled_target": "goals",
 }
 
-if not TYPE_CHECKING:  # type checkers report these names, and every other one that is missing
+if not TYPE_CHECKING:  # hidden from type checkers, which then report missing names
 
     def __getattr__(name: str) -> object:
         """Returns a name that has moved to a sub-package, with a warning."""

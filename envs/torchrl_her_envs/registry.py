@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from torchrl_her_envs.throwing.tasks import TASKS
 
-if TYPE_CHECKING:  # loads torch
+if TYPE_CHECKING:  # this import would load torch
     from torchrl.envs import EnvBase
 
 GYM = "gym:"  # prefix of the id of a gymnasium environment

@@ -65,7 +65,8 @@ class AchievedGoals:
             raise ValueError(f"{number} goals of each run do not fit into a memory of {self.capacity}")
         if self._rows is None:
             self._rows = self._empty(goals), self._empty(observations)
-        if self._written.device != goals.device or self._rows[0].device != goals.device:  # after loading
+        # The tensors may have been loaded on another device.
+        if self._written.device != goals.device or self._rows[0].device != goals.device:
             self._rows = self._rows[0].to(goals.device), self._rows[1].to(goals.device)
             self._written = self._written.to(goals.device)
         finite = goals.isfinite().all(-1)

@@ -316,7 +316,7 @@ class BehaviorGoals(Transform):
                 generator=RunDraws(self.generators, candidates.run),
             )
         goals = candidates.goals.take_along_dim(place.unsqueeze(-1), 1).squeeze(1)
-        if not bool(valid.all()):  # without a valid goal, the task's own stays
+        if not bool(valid.all()):  # environments without a valid goal keep the task's
             chosen, goals = chosen.index_put((chosen.clone(),), valid), goals[valid]
             counts = self._counts(chosen, len(begins))
         if self.weights and self.update_on == "proposed":

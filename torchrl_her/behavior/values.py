@@ -92,7 +92,7 @@ class GoalValues:
         if values is None:
             raise ValueError(f"{type(self.loss).__name__} has no critics whose values are known")
         lengths = torch.tensor(counts, device=goals.device).unsqueeze(1)
-        is_row = (torch.arange(max(counts), device=goals.device) < lengths).flatten()  # not padding
+        is_row = (torch.arange(max(counts), device=goals.device) < lengths).flatten()  # False for padding
         return values.to(goals.device).unflatten(0, (len(blocks), width))[is_row]
 
 

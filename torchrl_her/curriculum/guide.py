@@ -105,14 +105,14 @@ class GuidedExploration(TensorDictModuleBase):
             self.module = deepcopy(policy).requires_grad_(False)
         else:
             self.in_keys.append(stage_key)
-            self._policy = (policy,)  # in a tuple: as a submodule, its weights would be registered twice
+            self._policy = (policy,)  # in a tuple, since a submodule's weights would be registered twice
         self.curriculum, self.share, self.per = curriculum, share, per
         self.generators = [None] * runs if generators is None else list(generators)
         self.register_buffer("stage", torch.full((runs,), -1))
         self.guided: Tensor | None = None
-        # For each stage: columns of its inputs, achieved and desired goal in ``Curriculum.extend(state)``.
+        # Columns of each stage's inputs, achieved goal and desired goal in ``Curriculum.extend(state)``.
         self._columns = torch.tensor([self._columns_of(stage) for stage in curriculum.stages])
-        # An episode is guided up to the stage below its own, so the last stage needs no threshold here.
+        # The guide acts up to the stage below the episode's, so the last stage needs no threshold here.
         self._squares = torch.tensor([(stage.threshold or 0.0) ** 2 for stage in curriculum.stages])
 
     @property
@@ -160,7 +160,7 @@ class GuidedExploration(TensorDictModuleBase):
         if not bool((guided >= 0).any()):
             return tensordict
         acting, after = guided >= 0, guided + 1
-        if self.per == "step" and top is not None:  # goals of lower stages may be lost again
+        if self.per == "step" and top is not None:  # goals of lower stages may be missed again
             after = self._after_the_last_achieved(state, top)
         else:
             acting &= self._achieved(state, guided)
@@ -169,7 +169,7 @@ class GuidedExploration(TensorDictModuleBase):
         rows = TensorDict({self.guide.in_keys[0]: inputs}, tensordict.batch_size)
         policy_action = tensordict.get(action_key)
         acts = guided >= 0 if policy_action.ndim == guided.ndim else (guided >= 0).squeeze(-1)
-        # Greedy: the guide is called for all runs if one is guided, so it must not use their random numbers.
+        # The guide is greedy: it is called for all runs if one is guided, and must use no random numbers.
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             action = self.guide(rows).get(action_key)
         return tensordict.set(action_key, torch.where(acts, action, policy_action))

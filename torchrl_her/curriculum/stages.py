@@ -83,7 +83,7 @@ class CurriculumStage:
         if not any(isinstance(entry, str) for key in _LISTS for entry in getattr(self, key)):
             self._check_indices()
 
-    @cached_property  # the same function for all runs in a stage, so that a writer can relabel them at once
+    @cached_property  # one function for all runs in a stage, so that a writer can relabel them together
     def reward_fn(self) -> RewardFunction | None:
         """Reward function of the stage's goals; None without a threshold."""
         if self.threshold is None:
@@ -99,7 +99,7 @@ class CurriculumStage:
                 raise ValueError(f"stage {self.name!r}: {key} must have indices of at least 0, got {entries}")
             if len(set(entries)) < len(entries):
                 raise ValueError(f"stage {self.name!r}: {key} must have each index once, got {entries}")
-        for key in ("observation", "achieved_goal"):  # observation and achieved goal usually share entries
+        for key in ("observation", "achieved_goal"):  # these may share entries, but not with the desired goal
             shared = sorted(set(self.desired_goal) & set(getattr(self, key)))
             if shared:
                 raise ValueError(
@@ -334,10 +334,10 @@ class CurriculumProgress:
             raise ValueError(f"success_threshold must be in (0, 1], got {success_threshold}")
         self.curriculum, self.runs = curriculum, runs
         self.window, self.success_threshold, self.patience = window, success_threshold, patience
-        # Plain numbers: transforms read them in every step, and must not wait for a device.
+        # Stages are plain numbers, since transforms read them in every step and must not wait for a device.
         self.stages = (0,) * runs
         self._successes: list[list[float]] = [[] for _ in range(runs)]
-        self._evaluations = [0] * runs  # evaluations in the present stage
+        self._evaluations = [0] * runs  # number of evaluations in each run's current stage
 
     @property
     def stage(self) -> Tensor:

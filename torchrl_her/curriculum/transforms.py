@@ -47,7 +47,7 @@ class _StageTransform(Transform):
         super().__init__(in_keys=in_keys, out_keys=out_keys)
         self.curriculum, self.progress, self.run = curriculum, progress, run
         self.stage_key = unravel_key(stage_key)
-        self._table: tuple[Any, Any] = (None, None)  # stages and device of a table of columns, and the table
+        self._table: tuple[Any, Any] = (None, None)  # cache: stages and device, and their table of columns
         self._shown_in: tuple[int, ...] | None = None  # stages of all runs in the last step or reset
 
     def _stages(self) -> tuple[int, ...]:
@@ -76,7 +76,7 @@ class _StageTransform(Transform):
         check_blocks(shape[:-1], self.progress.runs if self.run is None else 1)
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        if self._shown_in is None:  # later resets may be partial: the other rows keep their stage
+        if self._shown_in is None:  # first reset only: in a partial one, other rows keep their stage
             self._shown_in = self.progress.stages
         return self._call(tensordict_reset)
 
@@ -95,7 +95,7 @@ class _StageTransform(Transform):
         for key in self.out_keys:
             entry, new = root.get(key), again.get(key)
             differs |= (entry != new).any(-1)
-            entry.copy_(new)  # in place, as the collector keeps this tensor but not this TensorDict
+            entry.copy_(new)  # in place, since the collector keeps this tensor but not this TensorDict
         return differs
 
     def _get(self, tensordict: TensorDictBase, key: NestedKey, width: int) -> Tensor:

@@ -79,7 +79,7 @@ class StageView:
         next_keys = (under_next(self.observation_key), keys.next_achieved, keys.goals[1])
         for state_key, names in ((self.state_key, current_keys), (under_next(self.state_key), next_keys)):
             entries = self.curriculum.show(entry_of(rows, state_key), self.stage)
-            for key, entry in zip(names, entries, strict=True):  # the stage's own rows keep their goals
+            for key, entry in zip(names, entries, strict=True):  # rows of this stage keep their goals
                 out.set(key, torch.where(played, entry_of(rows, key), entry))
         for key in (keys.stage, under_next(keys.stage)):
             if (stages := out.get(key, None)) is not None:

@@ -143,7 +143,7 @@ class DemonstrationStarts(Transform):
         ):
             new = run_begun.nonzero().flatten()
             if len(new) == 0:
-                continue  # no numbers are drawn, so that a run draws the same ones beside other runs
+                continue  # a run without resets draws no numbers, so runs do not depend on each other
             u = torch.rand(len(new), 3, generator=generator, dtype=torch.float64)
             started = u[:, 0] < self.share
             demonstrations, (least, most) = self._shown[run], self.walk.window(run)
@@ -175,7 +175,7 @@ class DemonstrationStarts(Transform):
             env = below
         return env
 
-    # Part of the state_dict, which collectors include in theirs
+    # State of the transform, which collectors include in their state_dict
 
     def get_extra_state(self) -> dict[str, Any]:
         """Returns the state of :attr:`walk`, of the open episodes, and of the generators."""
@@ -197,7 +197,7 @@ class _Outcomes(Transform):
 
     def __init__(self, starts: DemonstrationStarts) -> None:
         super().__init__()
-        self.__dict__["starts"] = starts  # not a submodule: the starts are in the environment already
+        self.__dict__["starts"] = starts  # not registered as a submodule: the environment already has it
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         self.starts.note(next_tensordict)

@@ -62,7 +62,7 @@ class WalkBack:
 
     def record(self, run: int, outcomes: Sequence[bool]) -> None:
         """Records whether episodes of a run that started at demonstrations achieved their goal."""
-        for outcome in outcomes:  # one by one: starts may move back after each of them
+        for outcome in outcomes:  # one by one, since starts may move back after each outcome
             latest = [*self._outcomes[run], outcome][-self.samples :]
             if len(latest) == self.samples and sum(latest) >= self.threshold * self.samples:
                 self.back[run], latest = min(self._longest[run], self.back[run] + self.stride), []

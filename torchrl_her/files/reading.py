@@ -19,10 +19,10 @@ from zipfile import ZIP_STORED, ZipFile
 import torch
 from torch import Tensor, nn
 
-_STEPS = 1 << 22  # most opcodes of a pickle: checking so many takes a few hundred megabytes
+_STEPS = 1 << 22  # largest number of opcodes of a pickle: checking them takes a few hundred megabytes
 _DEPTH = 100
-_REPEATED = 1 << 24  # most elements by which tensors may exceed their storages, as expanded views do
-# The last bytes of an archive by torch.save: size and place of the directory, and place of what follows it.
+_REPEATED = 1 << 24  # number of elements by which tensors, as expanded views, may exceed their storages
+# Last bytes of an archive by torch.save: size and offset of the directory, and offset of its end record.
 # If these contradict each other, zipfile and torch may read different directories.
 _END = struct.Struct("<4s36xQQ4s4xQ4x4s16xH")
 _MARKS = (b"PK\6\6", b"PK\6\7", b"PK\5\6")
@@ -38,7 +38,7 @@ _NAMES = {
     *(f"torch {name}" for name in dir(torch) if name.endswith("Storage")),
     *(f"torch {name}" for name in dir(torch) if isinstance(getattr(torch, name), torch.dtype)),
 }
-_NAME, _STORAGE = -1, 6  # sizes of a name and of the tuple ("storage", type, key, device, count)
+_NAME, _STORAGE = -1, 6  # marks a name; size of the tuple ("storage", type, key, device, count)
 _SIZES = {"GLOBAL": _NAME, "BINPERSID": _STORAGE}
 _NEEDS = {"REDUCE": _NAME, "NEWOBJ": _NAME, "BINPERSID": _STORAGE}  # size of an opcode's first operand
 _PLAIN = (bool, int, float, str, type(None), torch.dtype, dict, list, tuple)
@@ -95,7 +95,7 @@ def load_tensors(file: BinaryIO, *, map_location: torch.device | str = "cpu") ->
         file.seek(begin)
         loaded = torch.load(file, map_location="cpu", weights_only=True, mmap=False)
         _check_tree(loaded)
-        if torch.device(map_location).type != "cpu":  # where storages may take any declared size
+        if torch.device(map_location).type != "cpu":  # other devices allocate any size that a file declares
             file.seek(begin)
             loaded = torch.load(file, map_location=map_location, weights_only=True, mmap=False)
         return loaded

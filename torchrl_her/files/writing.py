@@ -51,8 +51,8 @@ def written(path: str | Path) -> Iterator[Path]:
         raise OSError(error.errno, error.strerror, str(path)) from error
     finally:
         part.unlink(missing_ok=True)  # after an error, the partial file must not fill the disk
-    if os.name == "posix":  # folders can be opened on POSIX systems alone
-        _sync(path.parent)  # without it, a loss of power may undo the renaming
+    if os.name == "posix":  # only POSIX systems can open a folder
+        _sync(path.parent)  # without this sync, a loss of power may undo the renaming
 
 
 def write_text(path: str | Path, text: str) -> None:

@@ -16,9 +16,9 @@ from torchrl_her.goals.factors import between, combine, draw, draw_uniformly, dr
 from torchrl_her.goals.weights import checked_weights
 from torchrl_her.randomness import RunDraws
 
-# Greatest number of likelihoods [transitions, W] that are computed at once, to bound memory.
+# Largest number of likelihoods [transitions, W] that are computed at once, to bound memory.
 LIKELIHOODS = 1 << 17
-# How often goals that the filter refuses are drawn anew if lines are long.
+# Number of times that goals refused by the filter are drawn again, if lines of candidates are long.
 TRIES = 8
 
 Index = Tensor | slice

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from torchrl_her.goals.grid import Numbers
 
-_CHUNK = 1 << 20  # distances held at once: 8 MiB of float64
-_LEAST_SCALE = 0.01  # as a fraction of the scale of the widest dimension
+_CHUNK = 1 << 20  # number of distances that are computed at once: 8 MiB of float64
+_LEAST_SCALE = 0.01  # least scale of a dimension, as a fraction of the widest one's
 _FARTHEST = 1e140  # coordinates, in sigmas, beyond which squares of float64 would overflow
 
 
@@ -56,8 +56,8 @@ def log_kernel_density(points: Tensor, samples: Tensor, sigma: Numbers) -> Tenso
     """
     flat, known = _checked(points, samples)
     scale = _scale(sigma, known)
-    center = known.mean(0)  # near 0 sums of squares lose the fewest digits
-    # Clamped, since squares would overflow to infinity minus infinity; NaN and infinity are marked below.
+    center = known.mean(0)  # subtracted, since sums of squares lose the fewest digits near 0
+    # Goals are clamped, since squares could overflow to infinity; NaN and infinity are marked below.
     flat = ((flat - center) / scale).clamp_(-_FARTHEST, _FARTHEST)
     known = ((known - center) / scale).clamp_(-_FARTHEST, _FARTHEST)
     parts = [_log_sum(part, known) for part in flat.split(max(1, _CHUNK // len(known)))]
@@ -134,7 +134,7 @@ def _log_sum(points: Tensor, samples: Tensor) -> Tensor:
 def _kth_distance(points: Tensor, samples: Tensor, k: int) -> Tensor:
     """Returns the distance [m] to the k-th nearest sample."""
     nearest = _squares(points, samples).topk(k, 1, largest=False, sorted=False).indices
-    # Products lose the digits of small distances, so these few are computed again by differences.
+    # Matrix products lose the digits of small distances, so the k nearest are computed again as differences.
     return (points.unsqueeze(1) - samples[nearest]).norm(dim=-1).amax(1)
 
 

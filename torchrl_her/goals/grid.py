@@ -16,9 +16,9 @@ from torch import Tensor
 
 from torchrl_her.checks import check_finite
 
-_MAX_CELLS = 1 << 24  # a table of float64 is then 128 MiB, and five are kept
-_CHUNK = 1 << 21  # kernel values held at once when summing over samples
-_THIN = 1e-4  # in units of sigma: differences over thinner boxes would lose digits
+_MAX_CELLS = 1 << 24  # most cells of a grid: a float64 table takes 128 MiB, and five are kept
+_CHUNK = 1 << 21  # number of kernel values that are computed at once when summing over samples
+_THIN = 1e-4  # width of a box, in sigmas, below which differences over it would lose digits
 
 Numbers = float | Sequence[float] | Tensor
 
@@ -164,7 +164,8 @@ def _log_mass(x: Tensor, low: float, high: float, sigma: float) -> Tensor:
     outside = torch.special.erfcx(near / root) - torch.special.erfcx(far / root) * torch.exp(
         -width * (near + far) / 2
     )
-    thin = math.sqrt(2 / math.pi) * width * torch.exp(-width * (near + width / 4) / 2)  # at the box's middle
+    # Over a thin box, the integral is the width times the kernel at the middle.
+    thin = math.sqrt(2 / math.pi) * width * torch.exp(-width * (near + width / 4) / 2)
     outside = torch.where(width * (1 + near) < _THIN, thin, outside)
     mass = torch.where(near > 0, outside, inside).clamp_min(torch.finfo(x.dtype).tiny)
     return mass.log() - near.square() / 2

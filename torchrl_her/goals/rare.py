@@ -16,8 +16,8 @@ from torchrl_her.goals.weights import GoalWeights, normalized_weights, spread_ev
 Estimator = Literal["kernel", "neighbors"]
 
 _LEVEL = 128  # number of samples; the median of their densities is the density of an ordinary goal
-_LEAST_DISTANCE = 1e-3  # in standard deviations: nearer goals count as equal
-_SHARPEST = 3.0  # beyond this many dimensions, the default of sharpness falls
+_LEAST_DISTANCE = 1e-3  # distance in standard deviations below which goals count as equal
+_SHARPEST = 3.0  # number of dimensions above which the default of sharpness falls
 
 
 class RareGoals(GoalWeights):

@@ -65,7 +65,7 @@ def achieved(achieved_goal: Tensor, desired_goal: Tensor, threshold: float) -> T
     """
     if not achieved_goal.is_floating_point():  # squares of int8, for example, overflow
         achieved_goal, desired_goal = achieved_goal.float(), desired_goal.float()
-    # Coordinate by coordinate: summing over so short a dimension would take torch several times as long.
+    # Coordinates are added one by one: torch takes several times as long to sum over a short dimension.
     pairs = zip(achieved_goal.unbind(-1), desired_goal.unbind(-1), strict=True)
     return reduce(torch.add, [(one - other).square() for one, other in pairs]) < threshold**2
 
@@ -237,7 +237,7 @@ def _takes(function: Callable[..., object], arguments: Sequence[object]) -> bool
         inspect.signature(function).bind(*arguments)
     except TypeError:
         return False
-    except ValueError:  # no signature, as with functions in C
+    except ValueError:  # functions in C may have no signature
         return True
     return True
 

@@ -20,8 +20,8 @@ from torchrl_her.goals.weights import GoalWeights, normalized_weights, spread_ev
 
 _GOAL = "goal"
 _LEAST_ERROR = 1e-30
-_FARTHEST = 1e15  # beyond this, sums of squares of float32 would overflow
-_RANGE = 2.0  # standard deviations within which most goals are
+_FARTHEST = 1e15  # largest coordinate: squares of larger ones overflow in float32
+_RANGE = 2.0  # most goals are within this many standard deviations of the mean
 
 
 class NetworkNovelty(GoalWeights):

@@ -32,7 +32,7 @@ def episode(time: Tensor, lengths: Tensor) -> tuple[Tensor, Tensor]:
 STRATEGIES: dict[str, StrategyFunction] = {"future": future, "final": final, "episode": episode}
 _SAFE = tuple(STRATEGIES.values())  # these never leave the episode, so their candidates are not checked
 
-# Sources of goals that are no strategies, as they look beyond the episode: see ``check_goal_sources``.
+# Sources that are no strategies, since they take goals of other episodes: see ``check_goal_sources``.
 RECENT = ("actual", "achieved")
 
 

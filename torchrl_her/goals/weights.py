@@ -159,5 +159,5 @@ def spread_evenly(count: int, most: int, device: torch.device | None = None) -> 
     n = min(count, most)
     part = torch.arange(n, device=device)
     begin, end = part * count // max(n, 1), (part + 1) * count // max(n, 1)
-    share = (part.double() * GOLDEN).frac()  # place within the part: differs between neighboring parts
+    share = (part.double() * GOLDEN).frac()  # place within each part, which varies between neighbors
     return begin + ((end - begin) * share).long()

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torchrl_her.checks import check_blocks, check_whole, entry_of
 from torchrl_her.modules.networks import by_run
 
-_RELATIVE_STD = 1e-4  # relative to the mean: smaller deviations are hardly above float32's rounding
+_RELATIVE_STD = 1e-4  # least deviation relative to the mean; smaller ones may be float32's rounding
 
 
 class Moments(NamedTuple):
@@ -282,7 +282,7 @@ class RunningNorm(nn.Module):
         columns = self.columns_of(key)
         self._check(key, values)
         check_blocks(values.shape[:-1], self.runs)
-        if not values.is_floating_point():  # means and deviations would be rounded to whole numbers, too
+        if not values.is_floating_point():  # else means and deviations would be rounded to integers
             values = values.to(torch.get_default_dtype())
         n, mean, std = (statistic[:, columns] for statistic in (self.n, self.mean, self.std))
         limit = torch.where(n > 0, self.clip, torch.inf)  # before the first update nothing is clipped

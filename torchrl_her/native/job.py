@@ -21,7 +21,7 @@ class Algorithm(IntEnum):
     TQC = 4
 
 
-STOCHASTIC = (Algorithm.SAC, Algorithm.TQC)  # whose actors draw from a distribution, with a temperature
+STOCHASTIC = (Algorithm.SAC, Algorithm.TQC)  # algorithms with a stochastic actor and a temperature
 
 
 class Activation(IntEnum):

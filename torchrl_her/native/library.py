@@ -28,7 +28,7 @@ _FLAGS = (
     "-shared",
     "-fPIC",
 )
-# Options, tried in this order: not every compiler knows all, and some (zig) have no library for OpenMP.
+# Compiler options, tried in this order: some compilers lack some of them, or (zig) OpenMP's library.
 _EXTRAS = (
     ("-march=native", "-mprefer-vector-width=512", "-fopenmp"),
     ("-march=native", "-mprefer-vector-width=512", "-fopenmp-simd"),
@@ -39,8 +39,8 @@ _EXTRAS = (
     (),
 )
 _V3 = frozenset(("abm", "avx2", "bmi1", "bmi2", "f16c", "fma", "movbe"))
-_ARM: dict[str, frozenset[str]] = {"armv8-a": frozenset()}  # any processor of this kind
-# Levels, that is sets of instructions, for which wheels have libraries: the fastest first, with the flags of
+_ARM: dict[str, frozenset[str]] = {"armv8-a": frozenset()}  # every ARM processor of 64 bits has this level
+# Instruction sets (levels) for which wheels have libraries: the fastest first, with the flags of
 # each in /proc/cpuinfo.
 LEVELS = {
     "x86_64": {
@@ -48,9 +48,9 @@ LEVELS = {
         "x86-64-v3": _V3,
     },
     "aarch64": _ARM,
-    "arm64": _ARM,  # its name on macOS
+    "arm64": _ARM,  # aarch64 is called arm64 on macOS
 }
-_SHIPPED = Path(__file__).parent  # in a wheel it has a folder for each level
+_SHIPPED = Path(__file__).parent  # in a wheel, this folder has a subfolder for each level
 _LOGGER = logging.getLogger("torchrl_her")
 
 
@@ -133,7 +133,7 @@ def levels(machine: str, flags: Collection[str]) -> list[str]:
 
 def _load_shipped(source: str, real: str) -> ctypes.CDLL:
     for level in levels(platform.machine(), _processor_flags().split()):
-        with contextlib.suppress(OSError):  # no wheel of this kind, or the system's libraries are older
+        with contextlib.suppress(OSError):  # not installed from a wheel, or system libraries are too old
             return ctypes.CDLL(str(_SHIPPED / level / shipped_name(source, real)))
     raise CannotCompile(f"no wheel has a library of {source} for this processor")
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from torchrl_her.native.library import CannotCompile, load_library
 
-_ARGUMENTS = {  # levels, widths, number of levels, runs, then the function's own
+_ARGUMENTS = {  # types of each function's arguments after levels, widths, number of levels and runs
     "her_trees_draw": [ctypes.c_int64, *[ctypes.c_void_p] * 3],
     "her_trees_set": [ctypes.c_int64, *[ctypes.c_void_p] * 2],
 }

@@ -10,8 +10,8 @@ from torchrl.objectives import LossModule
 
 from torchrl_her.objectives.cloning import Cloning, with_cloning
 
-FREE_ARGUMENT = 2.0  # arguments of tanh up to this cost nothing: tanh(2) is 0.964, and its slope 0.07
-LARGEST_ACTION = 1 - 1e-6  # beyond it float32 hardly tells arguments of tanh apart
+FREE_ARGUMENT = 2.0  # arguments of tanh up to 2 have no penalty: tanh(2) is 0.964, with a slope of 0.07
+LARGEST_ACTION = 1 - 1e-6  # nearer to 1, arguments of tanh are lost to float32's rounding
 
 
 def action_cost(action: Tensor, *, l2: float = 0.0, saturation: float = 0.0) -> Tensor:

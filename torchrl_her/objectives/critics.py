@@ -73,7 +73,7 @@ def critic_values(loss: LossModule, transitions: TensorDictBase) -> Tensor | Non
     else:
         return None
     training, values = network.training, []
-    network.eval()  # batch normalization neither uses nor changes the statistics of this batch
+    network.eval()  # batch normalization must neither use nor count this batch's statistics
     try:
         for weights in params.data.unbind(0) if params.ndim else [params.data]:
             with weights.to_module(network, preserve_module_state=False):
@@ -146,6 +146,6 @@ def connect_critics(loss: LossModule, critic: TensorDictModule | Sequence[Tensor
     if isinstance(critic, TensorDictModule) or len(critic) > 1:
         return
     weights = TensorDict.from_module(critic[0]).data.unsqueeze(0)
-    for name, params in loss.named_children():  # by name: TorchRL warns if targets are read before an update
+    for name, params in loss.named_children():  # not as attributes: TorchRL would warn about targets
         if name in ("qvalue_network_params", "target_qvalue_network_params"):
             params.data.update_(weights)

@@ -60,7 +60,7 @@ class PenalizedSACLoss(SACLoss):
         self.target_critics = checked_subset(target_critics, self.num_qvalue_nets)
         self.noise = noise or RunNoise()
         start: Tensor = self.log_alpha.detach()  # type: ignore[has-type]
-        dtype = next(self.actor_network_params.values(True, True)).dtype  # as fused steps need it
+        dtype = next(self.actor_network_params.values(True, True)).dtype  # fused steps need one dtype
         self.log_alpha = nn.Parameter(start.to(dtype).repeat(self.runs) if self.runs > 1 else start.to(dtype))
 
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:

@@ -78,7 +78,7 @@ class Targets:
         """
         least, greatest = self.reward_range or (-math.inf, math.inf)
         estimator = ClampedTD0(
-            low=min(least, least / (1.0 - self.gamma)),  # the return of one step, or of endless steps
+            low=min(least, least / (1.0 - self.gamma)),  # least return: of one step, or of infinitely many
             high=max(greatest, greatest / (1.0 - self.gamma)),
             gamma=self.gamma,
             value_network=value_network,

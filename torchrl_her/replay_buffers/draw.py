@@ -110,7 +110,7 @@ def draw_for_runs(
     """
     rows, piece, reward_fn, options = chunk.rows, chunk.piece, chunk.reward_fn, chunk.options
     episodes = piece.episodes
-    if options.k == 0:  # nothing to draw, and achieved goals may be missing
+    if options.k == 0:  # k=0 draws no goals, and achieved goals may be missing
         return episodes.lengths[:0], episodes.lengths[:0], [0] * len(piece.runs)
     drawn = _Transitions.of(episodes, options.per)
     after = entry_of(rows, chunk.keys.next_achieved)

@@ -72,4 +72,4 @@ class EnvIds(Transform):
         return out
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**super().__getstate__(), "_ids": None}  # a copy, for other environments, draws its own
+        return {**super().__getstate__(), "_ids": None}  # a copy has other environments and draws new ids

@@ -113,7 +113,7 @@ def index_episodes(
     # Only these flags are put in the order of time: moving the ids would take eight times as long.
     begins = new.roll(-oldest, 0).t().reshape(-1).nonzero().squeeze(-1)
     streams, behind = rows // slots, begins.new_tensor([rows])
-    if trajectory is None or done.ndim > 1:  # without ids, every run of rows is an episode
+    if trajectory is None or done.ndim > 1:  # without ids, rows between ends are one episode
         first = torch.cat((begins, behind))
         return EpisodeIndex(slots, streams, oldest, begins, begins, begins, begins, first)
     lengths = begins.diff(append=behind)
@@ -125,7 +125,7 @@ def index_episodes(
     whole = done[last]
     opens = torch.ones_like(whole)
     opens[1:] = (ordered_ids[1:] != ordered_ids[:-1]) | whole[:-1]
-    for after, before in seams:  # two runs are one episode only if these agree
+    for after, before in seams:  # segments are one episode only if these entries agree
         opens[1:] |= _differ(after[last[:-1]], before[(ordered_begins[1:] + oldest) % slots])
     first = torch.cat((ordered_places[opens], behind))
     return EpisodeIndex(slots, streams, oldest, begins, places, ordered_begins, ordered_places, first)

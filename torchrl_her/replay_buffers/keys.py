@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl_her.checks import check_finite, entry_of
 from torchrl_her.goals.rewards import Outcome, RewardFunction, ask_reward, outcomes
 
-LEAST_COST = 1e-4  # relative to a reward: smaller differences are rounding errors
+LEAST_COST = 1e-4  # smaller differences, relative to a reward, are rounding errors and no cost
 
 
 @dataclass(frozen=True)
@@ -126,7 +126,7 @@ def failures(
     reward, terminated = (entry_of(transitions, key).reshape(-1) for key in (keys.reward, keys.terminated))
     failed, cost = terminated & (reward < achieved_reward), torch.zeros_like(reward)
     at = failed.nonzero().squeeze(-1)
-    if len(at) > 0:  # an end by the reward function is a success, even with another reward
+    if len(at) > 0:  # if the reward function ends the episode, it is a success, whatever its reward
         reached, desired = keys.after(transitions, reward_fn)[at], entry_of(transitions, keys.goals[1])[at]
         own_reward, own_end = (answer.flatten() for answer in ask_reward(reward_fn, reached, desired))
         failed[at] = ~own_end

@@ -27,7 +27,7 @@ from torchrl_her.goals.weights import GoalWeights
 from torchrl_her.replay_buffers.keys import LEAST_COST, TransitionKeys, in_root_and_next, under_next
 
 Per = Literal["transition", "episode"]
-_SUSPICIOUS = 10  # so many episodes of one step hardly occur by chance
+_SUSPICIOUS = 10  # number of one-step episodes that hardly occurs by chance
 
 
 class _NotGiven(int):
@@ -182,7 +182,7 @@ class HindsightOptions:
         repeated = {name: changes[name] for name in ("k", "strategy") if name in changes}
         if sources is not None and repeated:
             raise ValueError(_twice(sources, **repeated))
-        if sources is not None or self.goal_sources is not None:  # then k is the sum of the sources
+        if sources is not None or self.goal_sources is not None:  # k and strategy get their defaults
             changes = {"k": HindsightOptions.k, "strategy": HindsightOptions.strategy, **changes}
         return replace(self, **changes)
 

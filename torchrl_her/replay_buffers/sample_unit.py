@@ -81,7 +81,7 @@ class _Chosen(NamedTuple):
     rows: Tensor  # [V], places in the flat batch
     goals: Tensor  # [V, g]
     ends: Tensor | None  # [B, 1] of bool, where a sampler of slices ends a slice
-    ahead: tuple[TensorDictBase, NStepReturn] | None  # with n steps: ``next`` of the last one, and returns
+    ahead: tuple[TensorDictBase, NStepReturn] | None  # with n steps: ``next`` of the last step, and returns
 
 
 class HERSampleUnit(HindsightBase, SampleUnit):
@@ -278,7 +278,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
         for key, value in self._keys.changes(chosen.goals, reward, terminated, truncated).items():
             entry = entry_of(out, key)
             value = stored_as(value, entry, key)
-            out.set(key, entry.index_copy(0, rows, value))  # a copy: what was read might be the storage
+            out.set(key, entry.index_copy(0, rows, value))  # a copy, since the entry may be the storage's
         return out
 
     def __getstate__(self) -> dict[str, Any]:
@@ -363,7 +363,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
         self, stored: _Stored, row: Tensor, virtual: Tensor, goals: Tensor
     ) -> tuple[TensorDictBase, NStepReturn]:
         """Computes ``next`` and returns over n steps of rows [B], some of which have virtual goals."""
-        gamma = self.options.gamma or 1.0  # options with n_steps > 1 have one
+        gamma = self.options.gamma or 1.0  # never None if n_steps > 1
         place = stored.episodes.place(row)
         places, inside = windows(place, stored.episodes.episode(place)[1], self.options.n_steps)
         window = stored.episodes.row(places)
@@ -393,7 +393,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
             refuse_consuming("HERSampleUnit", storage)
             refuse_unordered("HERSampleUnit", storage)
             refuse_shared("HERSampleUnit", storage)
-            if storage.ndim > 1:  # in flat storages, the sampler marks copies of rows
+            if storage.ndim > 1:  # in flat storages, slice samplers mark copies of rows
                 refuse_slices("HERSampleUnit", storage)
             rows = storage[:]  # a view
             if not is_tensor_collection(rows):

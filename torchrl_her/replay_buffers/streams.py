@@ -126,6 +126,6 @@ def _jumps(rows: TensorDictBase, keys: TransitionKeys, last: Tensor, new: Tensor
         return jumps
     for after, before in ((keys.next_achieved, keys.achieved), (keys.goals[1], keys.goals[0])):
         if (one := rows.get(after, None)) is None or (other := rows.get(before, None)) is None:
-            continue  # goals are not needed where none are drawn
+            continue  # goals may be missing if no virtual goals are drawn
         jumps[at] |= (one[last[at]] != other[new[at]]).flatten(1).any(1)
     return jumps

@@ -179,7 +179,7 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
         )
         if refill > 1 and self.options.per == "episode":
             raise ValueError(f"refill={refill} is for per='transition': the filter looks at each of them")
-        self._weights = run_weights  # weights of several runs
+        self._weights = run_weights  # weights of goals, if they belong to several runs
         self.runs = runs
         # reward functions of runs that do not use ``reward_fn``
         self._own_rewards: dict[int, RewardFunction] = {}
@@ -187,9 +187,9 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
         self._rings = Rings(runs)
         self._held = Batch.none(runs)  # transitions of open episodes
         self._recent = [RecentGoals.none(runs) for _ in range(max(1, len(self.stages)))]  # by stage
-        self._episodes = 0  # copies of episodes ever written, if whole ones are
+        self._episodes = 0  # number of copied episodes so far, if whole episodes are copied
         self._process = os.getpid()
-        # Whether, since the last write, held-back rows were loaded, or their episodes were ended.
+        # Whether, since the last write, held-back rows were loaded, or their episodes ended.
         self._loaded = self._all_over = self._overfull = False
 
     @property
@@ -276,7 +276,7 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
         held = self._held
         batch = Batch.of(data, self._keys, runs=self.runs).after(held)
         index, left, recent = self._write_episodes(batch, len(held))
-        # Last of all, so that a batch that cannot be written does not lose rows that were held back before.
+        # Set last, so that a batch that cannot be written does not lose rows that were held back before.
         self._held, self._recent = batch.take(left), recent
         self._loaded = self._all_over = False
         if not self.stages and not self._own_rewards:
@@ -427,7 +427,7 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
         if self.runs == 1:  # a single run writes at TorchRL's own cursor
             self._rings.cursors[0] = self._cursor
         places = Places(run, len(batch), runs=self.runs, device=streams.device)
-        most = self.k * self.refill + 1  # copies of a transition
+        most = self.k * self.refill + 1  # largest number of copies of a transition
         entries = max(1, min(_ROWS, self.capacity) // most), _ROWS // most
         episode_runs = None if run is None else run[episodes.rows[:, :1]].flatten()
         recent, settings, drafts, first_id = list(self._recent), self._settings(), [], self._episodes
@@ -500,7 +500,7 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
                     goals = draft.virtual.changes[self._keys.goals[0]]
                     self._weights_of_runs().update(goals, draft.runs, draft.virtual.counts)
             for place, draft in enumerate(drafts):
-                # Without ``on_write``, drafts are joined one by one: all at once would touch fresh memory.
+                # Without ``on_write``, drafts are joined one by one: joining all first takes more memory.
                 self._store(joined[place] if joined else join(draft), draft.runs, draft.counts)
                 for run, added in zip(draft.runs, draft.numbers, strict=True):
                     for written in (self._counts, self._totals):

@@ -38,8 +38,8 @@ from torchrl_her.torchrl_private import (
 
 _MAGIC = b"torchrl-her checkpoint 1\n"
 _PIECE = 1 << 26  # bytes between two syncs to disk
-_BODY = len(_MAGIC) + hashlib.sha256().digest_size  # where torch's file starts
-_REMAINING = "_remaining_batches"  # rest of a sampler's pass over the data, which TorchRL's states lack
+_BODY = len(_MAGIC) + hashlib.sha256().digest_size  # offset at which torch's file starts
+_REMAINING = "_remaining_batches"  # key for the rest of a sampler's pass, which TorchRL's states lack
 _PLAIN = (bool, int, float, str, type(None), torch.Size, torch.dtype)
 
 
@@ -118,7 +118,7 @@ def _write(state: dict[str, Any], file: BinaryIO) -> None:
         with config.patch("save.compute_crc32", False):  # type: ignore[attr-defined]
             torch.save(state, stream)  # type: ignore[arg-type]
     except RuntimeError as error:
-        if isinstance(error.__context__, OSError):  # torch hides the reason for which it could not write
+        if isinstance(error.__context__, OSError):  # torch hides the system's error, which names the reason
             raise error.__context__ from None
         raise
     file.seek(len(_MAGIC))
@@ -219,7 +219,7 @@ def load_collector_state_dict(collector: BaseCollector, state: dict[str, Any]) -
     if state["carrier"] is None:
         collector.load_state_dict(collector_state)
         return
-    collector.load_state_dict(collector_state, strict=False)  # the collector keeps its policy
+    collector.load_state_dict(collector_state, strict=False)  # the state has no policy
     carrier: Any = carrier_of(collector)
     collected = TensorDict.from_dict(state["carrier"], batch_size=carrier.batch_size)
     set_carrier(collector, carrier.empty().update(collected))
@@ -265,7 +265,7 @@ def _block(
             "packed": convert(storage.packed[begin:end]),
             "fields": [tuple(field) for field in storage.fields],
         }
-    rows = storage[:] if storage.ndim > 1 else storage[begin:end]  # the buffer's would be transformed
+    rows = storage[:] if storage.ndim > 1 else storage[begin:end]  # the buffer would transform them
     return {"entries": rows.apply(convert).to_dict(), "shape": list(rows.batch_size)}
 
 
@@ -332,7 +332,7 @@ def sampler_state_dict(sampler: Sampler, size: int) -> dict[str, Any]:
     For a prioritized sampler it holds the priorities of the first ``size`` rows only, which are filled.
     """
     if isinstance(sampler, SamplerEnsemble):
-        # Whole trees of the ensemble's members: the number of filled rows of each is not known here.
+        # The members' trees are saved whole, since the number of filled rows of each is not known here.
         state: dict[str, Any] = {
             str(i): sampler_state_dict(part, capacity_of(part)) for i, part in enumerate(samplers_in(sampler))
         }

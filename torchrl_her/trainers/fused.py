@@ -123,7 +123,7 @@ class FusedLearner:
         call = self._call(rows, steps)
         call.set_idle(idle)
         with idle_runs(self.loss, self.target, idle):
-            if isinstance(self.target, HardUpdate):  # copies the weights after some of the steps
+            if isinstance(self.target, HardUpdate):  # a hard update copies weights after some steps only
                 losses = []
                 for step in range(steps):
                     losses.append(self._run(call, step, 1))

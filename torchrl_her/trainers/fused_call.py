@@ -18,7 +18,7 @@ from torchrl_her.replay_buffers.keys import under_next
 from torchrl_her.replay_buffers.n_steps import STEPS_KEY
 from torchrl_her.trainers.fusing import FusedLoss
 
-# OpenMP's threads are not there in a process that was forked; starting them anew hangs.
+# Has an entry in a forked process, which lacks OpenMP's threads and would hang if it started new ones.
 _FORKED: list[bool] = []
 os.register_at_fork(after_in_child=lambda: _FORKED.append(True))
 
@@ -148,7 +148,7 @@ class FusedCall:
             job.action = self._entry(action, self._actions, key)
         job.reward = self._entry(rows.get(("next", "reward")), 1, ("next", "reward"))
         terminated = rows.get(("next", "terminated"), None)
-        if terminated is None:  # as in TorchRL's targets
+        if terminated is None:  # TorchRL's targets then use done, too
             terminated = rows.get(("next", "done"))
         job.terminated = self._entry(terminated, 1, ("next", "terminated"), torch.bool)
         weight = rows.get("priority_weight", None)
@@ -156,7 +156,7 @@ class FusedCall:
             job.weight = self._entry(weight, 1, "priority_weight")
         span = rows.get(self._loss.value_estimator.tensor_keys.steps_to_next_obs, None)
         if span is not None:
-            # with the loss's own tensor: so powers are rounded as TorchRL's are
+            # The loss's tensor is used, not a number, so that powers are rounded as in TorchRL.
             discount = self._loss.value_estimator.gamma.to(span.device) ** span
             job.discount = self._entry(discount, 1, STEPS_KEY)
 

@@ -77,7 +77,7 @@ class FusedWeights:
             )
         ):
             for state in states:
-                state["step"] = state["step"].to(torch.float32)  # float64 where that is torch's default
+                state["step"] = state["step"].to(torch.float32)  # made as float64 if that is torch's default
             self._check(states)
             self._memory = [
                 (parameter.data_ptr(), [state[name] for name in _STATE])
@@ -131,7 +131,7 @@ class FusedWeights:
         height, width = tensor.shape[-2:] if tensor.ndim > 1 else (1, 1)
         offset, state = critic * (tensor.numel() // critics), self._state(tensor)
         tensors = (tensor, target, state.get("exp_avg"), state.get("exp_avg_sq"))
-        counter = _address(state.get("step"), 0) if critic == 0 else None  # a stack of critics has one
+        counter = _address(state.get("step"), 0) if critic == 0 else None  # all critics of a stack share one
         return height, width, *(_address(each, offset) for each in tensors), counter
 
 

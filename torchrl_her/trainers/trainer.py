@@ -152,7 +152,7 @@ class Trainer:
         self.average = average
         self.frames = self.updates = self.epochs = 0
         self._credit = 0.0  # gradient steps that the frames so far allow and that were not made yet
-        self._measured: list[dict[str, Tensor]] | None = None  # in the present epoch
+        self._measured: list[dict[str, Tensor]] | None = None  # losses and other values of the present epoch
         self._outside = 0  # frames collected by run(), which belong to no epoch
 
     @property
@@ -259,9 +259,9 @@ class Trainer:
         if priority is None:
             return
         priorities = drawn.select("index")
-        # The type of the sampler's trees, also for networks in float64.
+        # The sampler's trees have float32, even if networks have float64.
         priorities.set(key, priority.flatten(0, 1).float())
-        if idle:  # idle runs were given rows of other runs
+        if idle:  # the rows of idle runs belong to other runs
             learned = [run for run in range(self.runs) if run not in idle]
             priorities = priorities.view(self.runs, -1)[learned].flatten()
         self.buffer.update_tensordict_priority(priorities)  # does nothing under a sampler without priorities

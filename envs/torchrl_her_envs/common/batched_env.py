@@ -255,7 +255,7 @@ class BatchedEnv(GoalEnv):
         for key, entry in tensordict.items():
             if key in entries:
                 entries[key] = torch.where(done, entries[key], entry)
-            else:  # entries of the old episode: an action, the ends, or the memory of a policy
+            else:  # entries that a reset clears: an action, the ends, or the memory of a policy
                 entries[key] = _cleared(entry, done)
         return self._pack(entries)
 

@@ -12,7 +12,7 @@ Termination = Literal["auto", "own", "success", "reward", "never", "watch"]
 Ends = Literal["own", "success", "reward", "never", "watch"]
 
 _LOGGER = logging.getLogger("torchrl_her_envs")
-_MOST_VALUES = 2  # most different rewards of missed goals in a sparse reward
+_MOST_VALUES = 2  # largest number of different rewards that missed goals have in a sparse reward
 _SHOWN = 3  # number of rewards in a message
 _DIGITS = 5  # decimal places to which rewards are compared
 _said: set[str] = set()
@@ -223,7 +223,7 @@ def check_rewards(
         (-3.0, -0.1, True)
     """
     missed = _missed(equal, others)
-    equal = equal + 0.0  # never -0.0
+    equal = equal + 0.0  # turns -0.0 into 0.0
     if not len(missed):
         least, most = min(others) + 0.0, max(others) + 0.0
         raise ValueError(

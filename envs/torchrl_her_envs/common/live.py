@@ -122,7 +122,7 @@ class LiveEpisodes:
             stepped = self._env.step(self._policy(self._shown))
             after = stepped["next"]
             self.step_count += 1
-            out_of_time = self.step_count == self._base.max_steps  # also if transforms override the ends
+            out_of_time = self.step_count == self._base.max_steps  # needed if transforms override the ends
             self._success[self.running] = self._achieved(after)[self.running]
             self._shoot(after["done"] | out_of_time)
             if self.running:

@@ -43,7 +43,7 @@ _SUCCESS = "is_success"
 # Options of make_own_env itself, which each environment takes.
 _OURS = ("max_steps", "termination", "achieved_reward", "info_keys", *(f"{key}_key" for key in KEYS))
 _TRIED_STEPS = 100
-_PAIRED = 8  # number of achieved and of desired goals that are paired to try rewards
+_PAIRED = 8  # number of achieved and of desired goals whose pairs are passed to the reward to try it
 
 
 def make_own_env(
@@ -113,7 +113,7 @@ def make_own_env(
             return [make_one(1, seed) for _ in range(count)]
         if isinstance(seed, int):
             return [make_one(count, seed)]
-        block_keys(seed, count)  # raises if they cannot be shared out
+        block_keys(seed, count)  # raises if seeds do not divide the environments evenly
         share = count // len(seed)
         first = make_one(share, seed[0])
         if callable(getattr(first, "set_seeds", None)):  # one object takes the seeds of all runs
@@ -166,7 +166,7 @@ def _load(path: str) -> Callable[..., Any]:
         make = getattr(importlib.import_module(module), name, None)
     except ModuleNotFoundError as error:
         if error.name is None or not f"{module}.".startswith(f"{error.name}."):
-            raise  # another module, which this one imports, is missing
+            raise  # the module exists, but imports one that is missing
         raise ValueError(
             f"there is no module {module!r} for task={path}, neither in this folder nor among the installed "
             "packages"
@@ -277,7 +277,7 @@ class OwnGoalEnv(GoalEnv):
         self._latest: list[TensorDictBase] = []
         self._steps = torch.zeros(count, 1, dtype=torch.int64)
         if rules is None:
-            self.goal_ends = GoalEnds(name, env_ends=None, tells_success=True)  # for the trial
+            self.goal_ends = GoalEnds(name, env_ends=None, tells_success=True)  # provisional, for the trial
             rules = self._try_out(check_termination(termination), achieved_reward)
         self.rules, self.goal_ends, self.dense_reward = rules, rules.ends, rules.dense
         self.missed_reward, self.achieved_reward = rules.missed_reward, rules.achieved_reward
@@ -571,7 +571,7 @@ class OwnGoalEnv(GoalEnv):
         stepped = after["reward"].flatten()
         computed = self.compute_reward(achieved, desired, after).flatten()
         reached = computed >= met
-        went_on = ~after["terminated"].flatten() | reached  # without failures, whose cost virtual goals keep
+        went_on = ~after["terminated"].flatten() | reached  # no failures: computed rewards lack their cost
         warn_once(check_same_rewards(self._name, stepped[went_on].numpy(), computed[went_on].numpy()))
         first, env_ends = self._envs[0], None
         if callable(getattr(first, "compute_terminated", None)):

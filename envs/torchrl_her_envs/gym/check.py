@@ -32,9 +32,9 @@ _OUR_OPTIONS = (
 EPISODES = 8  # number of first states whose goals serve to try the environment's functions
 _TRIED_STEPS = 100
 _LIMIT_STEPS = 1_000  # random steps in which an environment may show its own time limit
-_LIMIT = 100  # steps of an episode, if no time limit is found
+_LIMIT = 100  # number of steps of an episode, if no time limit is found
 _HALVINGS = 30
-_COARSE = 0.05  # largest step of float32, relative to the standard deviation of a goal
+_COARSE = 0.05  # rounding step of float32 that is too large, relative to a goal's standard deviation
 _NOISE = 1e-5  # standard deviation of an entry of goals, relative to the largest, below which it is noise
 
 
@@ -152,7 +152,7 @@ def check_methods(id: str, env: gymnasium.Env) -> None:
     wrappers = [env]
     while isinstance(wrappers[-1], gymnasium.Wrapper):
         wrappers.append(wrappers[-1].env)
-    for wrapper in reversed(wrappers):  # the innermost first: those around it fail, too
+    for wrapper in reversed(wrappers):  # the innermost first, since all wrappers around it fail, too
         name = type(wrapper).__name__
         reset, step = f"{id}: reset of {name} must", f"{id}: step of {name} must"
         parameters = inspect.signature(wrapper.reset).parameters
@@ -193,7 +193,7 @@ def goals_to_try(env: gymnasium.Env, layout: Layout) -> tuple[np.ndarray, np.nda
     observations = [env.reset(seed=seed)[0] for seed in range(EPISODES)]
     achieved, desired = (np.stack([layout.flatten(obs[key]) for obs in observations]) for key in KEYS[1:])
     pairs = np.repeat(achieved, EPISODES, 0), np.tile(desired, (EPISODES, 1))
-    # M must differ from all dimensions of a goal, see GoalFunction.
+    # The number M of pairs must differ from all dimensions of a goal, see GoalFunction.
     last = max(m for m in range(EPISODES * (EPISODES + 1) + 1) if m not in layout.sizes)
     achieved, desired = (np.concatenate([desired, goals])[:last] for goals in pairs)
     return achieved, desired

@@ -9,8 +9,8 @@ from __future__ import annotations
 import re
 from typing import Any
 
-_THRESHOLD = 0.05  # m, as in the environments themselves
-_AROUND = 0.025  # m: open fingers go around a block; closed ones stay 0.038 from its middle
+_THRESHOLD = 0.05  # distance in meters at which the environments count a goal as achieved
+_AROUND = 0.025  # meters to a block's middle at which open fingers are around it; closed ones stop at 0.038
 # Entries of an observation, in order, with their widths.
 _GRIPPER = {"grip": 3, "fingers": 2, "grip_speed": 3, "fingers_speed": 2}
 _OBJECT = {

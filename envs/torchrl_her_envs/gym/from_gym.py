@@ -135,7 +135,7 @@ def make_gym_env(
             choose_renderer()
             options["render_mode"] = PICTURES
             reference_env = opened.enter_context(closing(make_one(id, names, options)))
-        # Made by spec and not by id: new processes then need neither register the id nor load TorchRL.
+        # Environments are made by spec: by id, new processes would have to register it, and so load TorchRL.
         make = partial(make_quietly, gymnasium.registry[spec_of(reference_env).id], names, **options)
         vector = AsyncVectorEnv if parallel else SyncVectorEnv
         envs = opened.enter_context(closing(vector([make] * num_envs, autoreset_mode=AutoresetMode.DISABLED)))
@@ -147,7 +147,7 @@ def make_gym_env(
             achieved_reward=achieved_reward,
             info_keys=info_keys,
         )
-        opened.pop_all()  # from here on GymGoalEnv.close closes them
+        opened.pop_all()  # from here on, GymGoalEnv.close closes all environments
     return env
 
 
@@ -261,7 +261,7 @@ class GymGoalEnv(GoalEnv, GymWrapper):
         )
         computed = self._reward_of(trial.achieved, trial.desired, stepped)
         met = computed >= self.achieved_reward
-        went_on = ~trial.terminated | met  # without failures, whose cost virtual goals keep
+        went_on = ~trial.terminated | met  # no failures: computed rewards lack their cost
         warn_once(
             self._reward_of.hint(info) or check_same_rewards(id, trial.reward[went_on], computed[went_on])
         )
@@ -384,7 +384,7 @@ class GymGoalEnv(GoalEnv, GymWrapper):
     def _drawn(self, chosen: Sequence[int]) -> Sequence[Any]:
         if isinstance(self._env, SyncVectorEnv):
             return [self._env.envs[index].render() for index in chosen]
-        everything = self._env.render()  # in other processes, which all draw at once
+        everything = self._env.render()  # environments in other processes all draw at once
         return [everything[index] for index in chosen]
 
     def close(self, *, raise_if_closed: bool = True) -> None:

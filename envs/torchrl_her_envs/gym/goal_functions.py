@@ -23,7 +23,7 @@ class _OneInfo(dict[str, Any]):
 
     def __contains__(self, key: object) -> bool:
         present = super().__contains__(key)
-        if not present and isinstance(key, str):  # not the index of a row
+        if not present and isinstance(key, str):  # a string is an entry, no row's index
             self._lacking.add(key)
         return present
 

@@ -13,7 +13,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from torchrl_her_envs.gym.renamed import RenamedKeys
 
-if TYPE_CHECKING:  # each process of an environment imports this file, and TorchRL would take it seconds
+if TYPE_CHECKING:  # each process of an environment imports this file, and loading TorchRL takes seconds
     from torchrl_her_envs.common.goal_env import Names
 
 

@@ -20,7 +20,7 @@ Observation = dict[str, Any]  # arrays by name
 KEYS = ("observation", "achieved_goal", "desired_goal")
 FPS = 25
 _FIRST = np.zeros(1, np.int64)  # the index of the only environment
-_NO_LIMIT = 1 << 60  # steps; gymnasium's TimeLimit truncates episodes instead
+_NO_LIMIT = 1 << 60  # number of steps that no episode reaches: gymnasium's TimeLimit truncates episodes
 
 
 class GoalRules:

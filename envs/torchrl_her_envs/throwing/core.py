@@ -132,7 +132,7 @@ class ThrowingCore:
         """
         task, world, joints = self.task, self.world, self.effector.num_joints
         to_screen, to_speed = 2.0 / world.size, 1.0 / world.hand_speed
-        quantities = {  # rows, and factor and shift to observed coordinates
+        quantities = {  # for each quantity: rows, and factor and shift to observed coordinates
             "cosines": (joints, 1.0, 0.0),
             "sines": (joints, 1.0, 0.0),
             "grip": (2, to_screen, -1.0),
@@ -206,7 +206,7 @@ class ThrowingCore:
             goal = self.goal_distribution.from_uniform(u[:, n + 2 : n + 4])
         else:
             goal = ball * (2.0 / self.world.size) - 1.0
-        start = np.zeros((len(self._matrix), len(which)))  # at rest
+        start = np.zeros((len(self._matrix), len(which)))  # all velocities start at 0
         for name, value in (("joints", joints), ("grip", grip), ("ball", ball), ("goal", goal)):
             start[self._rows[name]] = value.T
         self._matrix[:, which] = start
@@ -298,7 +298,7 @@ class ThrowingCore:
         """Returns a bound on the speed of the grip, in meters a second."""
         if self.task.effector == "hand":
             return math.sqrt(2.0) * self.world.hand_speed
-        # each joint turns all links from it to the grip
+        # Each joint moves the grip by turning all links between them.
         return self.world.joint_speed * self.world.arm_length * (self.effector.num_joints + 1) / 2
 
     def _make_ball_starts(self) -> GoalDistribution:

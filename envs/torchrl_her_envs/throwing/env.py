@@ -25,8 +25,8 @@ from torchrl_her_envs.throwing.rules import reward_of
 from torchrl_her_envs.throwing.state import WorldState
 from torchrl_her_envs.throwing.tasks import Task, WorldConfig
 
-_PICTURE = 300  # pixels of a side, by default
-_OF_NUMPY: dict[torch.dtype, type[np.floating]] = {  # types that NumPy has too
+_PICTURE = 300  # default side of a picture in pixels
+_OF_NUMPY: dict[torch.dtype, type[np.floating]] = {  # NumPy's types for those of torch
     torch.float16: np.float16,
     torch.float32: np.float32,
     torch.float64: np.float64,
@@ -192,7 +192,7 @@ class ThrowingEnv(BatchedEnv):
 
     def picture_box(self) -> Box:
         """Returns the box of a picture: the screen and its margin."""
-        edge = 1.0 + 2.0 * MARGIN  # the screen is two wide
+        edge = 1.0 + 2.0 * MARGIN  # in observed coordinates, the screen is 2 wide
         return [-edge, -edge], [edge, edge]
 
     def regions(self) -> dict[str, Box]:
@@ -243,7 +243,7 @@ class ThrowingEnv(BatchedEnv):
 
     def load_world_state_dict(self, state: dict[str, Tensor]) -> None:
         self._check_state(state)
-        for field in fields(self.worlds):  # in place: the core has the same memory
+        for field in fields(self.worlds):  # copied in place, since the core uses the same memory
             getattr(self.worlds, field.name).copy_(state[field.name])
         self._keys = state["key"].numpy().copy().view(np.uint64)
 

@@ -24,7 +24,7 @@ class Hand:
     """
 
     num_joints = 2
-    # Joints and grip are the same, and observed once.
+    # A hand's joints are its grip, so only the grip is observed.
     shown: tuple[str, ...] = ("grip", "grip_velocity", "closed")
     observation_size = 5
     grip_index = (0, 1)

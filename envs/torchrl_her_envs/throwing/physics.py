@@ -19,15 +19,15 @@ from torch import Tensor
 from torchrl_her_envs.throwing.tasks import WorldConfig
 
 _FIELDS = pymunk.batch.BodyFields.POSITION | pymunk.batch.BodyFields.VELOCITY
-_BORDER = 0.5  # meters: half the thickness of the screen's sides, which lie outside of it
-_CELL = 1.0  # meters: side of a cell of the spatial hash; larger cells compare more balls with each other
+_BORDER = 0.5  # half the thickness in meters of the screen's sides, which lie outside of the screen
+_CELL = 1.0  # side in meters of a cell of the spatial hash; larger cells compare more balls
 _CELLS = 100  # number of cells of the spatial hash
 _SLOP = 1e-3  # meters that a ball may sink into a surface; Chipmunk's default, 0.1, is meant for pixels
 _SKIN = _SLOP / 2  # meters added to surfaces, so that a ball put against one touches it despite rounding
-_ITERATIONS = 4  # iterations of the solver: a ball touches at most a side and a corner at once
-_MOST = 64  # balls in the space at once: each is compared with all nearby ones
-_APART = 4.0  # meters between the edges of parked balls, and of the first and the screen's right side
-_PATIENCE = 64  # steps after which unused balls are removed
+_ITERATIONS = 4  # number of iterations of the solver: a ball touches at most a side and a corner at once
+_MOST = 64  # largest number of balls in the space: each is compared with all nearby ones
+_APART = 4.0  # meters between the edges of parked balls, and between the right side and the first ball
+_PATIENCE = 64  # number of steps after which unused balls are removed
 _FEW = 12  # number of balls up to which plain numbers are faster than arrays
 
 
@@ -61,7 +61,7 @@ class BallPhysics:
         self._step = world.time_step
         self._pull = world.gravity * self._substep
         self._limits = _Limits(world, wall=wall)
-        self._settled = np.full((4, num_worlds), np.nan)  # a state of each ball that a step leaves unchanged
+        self._settled = np.full((4, num_worlds), np.nan)  # last state of each ball that a step left unchanged
         self._space = _Space(world, wall=wall)
 
     def step(self, position: Tensor, velocity: Tensor, free: Tensor | None = None) -> tuple[Tensor, Tensor]:
@@ -151,7 +151,7 @@ class _Limits:
     """Coordinates beyond which a ball may touch a side of the screen or the wall."""
 
     def __init__(self, world: WorldConfig, *, wall: bool) -> None:
-        reach = world.ball_radius * world.size + 2 * _SKIN  # one skin more than needed, against rounding
+        reach = world.ball_radius * world.size + 2 * _SKIN  # one more skin than needed, because of rounding
         self._least, self._most = reach, world.size - reach
         self._wall: tuple[float, float, float] | None = None
         if wall:
@@ -245,7 +245,7 @@ class _Space:
             self._balls.append((body, ball))
         # pymunk lists the space's static body behind the balls: the last row is for that body, and stays 0
         self._parked = np.zeros((count + 1, 4))
-        # Beyond the right side, which is 2 * _BORDER thick whatever the size of the world.
+        # Parked balls lie beyond the right side, which is 2 * _BORDER thick whatever the size of the world.
         diameter = 2 * world.ball_radius * world.size
         first = world.size + 2 * _BORDER + diameter + _APART
         self._parked[:-1, 0] = first + (diameter + _APART) * np.arange(count)

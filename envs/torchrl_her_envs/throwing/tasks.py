@@ -48,25 +48,25 @@ class WorldConfig:
 
     size: float = 6.0  # side of the square screen
     pixels: int = 900  # the same side in pixels, the thesis's unit of length
-    gravity: float = 10.0  # thesis, appendix A
+    gravity: float = 10.0  # downward acceleration: thesis, appendix A
     bounce: float = 0.7  # share of the normal speed that a bounce keeps: thesis, appendix A
-    friction: float = 0.1  # kinetic: thesis, appendix A
+    friction: float = 0.1  # coefficient of kinetic friction: thesis, appendix A
     ball_mass: float = 3.0  # thesis, appendix A; only ratios of masses would matter
-    time_step: float = 0.04  # 25 actions a second
-    substeps: int = 4  # the fastest ball, 15.7 m/s, moves 0.157 m in each: see check_wall
-    max_steps: int = 50  # an episode is 2 s
+    time_step: float = 0.04  # duration of an action: 25 actions in a second
+    substeps: int = 4  # physics steps in an action; the fastest ball moves 0.157 m in each: see check_wall
+    max_steps: int = 50  # number of actions in an episode, which takes 2 s
     hand_speed: float = 8.0  # greatest speed in each direction: enough to throw across the screen
-    joint_speed: float = 4.0  # greatest speed, rad/s
-    ball_radius: float = 0.03  # screen; also the distance below which a hand catches or reaches the ball
-    hole_radius: float = 0.05  # screen; distance at which a ball is at the goal
+    joint_speed: float = 4.0  # greatest speed of each joint in rad/s
+    ball_radius: float = 0.03  # screen; also the distance below which a hand catches or reaches a ball
+    hole_radius: float = 0.05  # screen; also the distance below which a ball is at the goal
     hand_goals: tuple[float, float, float, float] = (0.55, 0.2, 0.95, 0.8)  # screen: left, bottom, right, top
-    arm_goals: tuple[float, float, float, float] = (0.72, 0.2, 0.95, 0.8)  # beyond the arm's reach
-    wall_x: float = 0.5  # screen: the wall's middle
-    wall_height: float = 0.5  # screen
-    wall_thickness: float = 0.02  # screen
-    arm_base: tuple[float, float] = (0.33, 0.5)  # screen: thesis, appendix A
+    arm_goals: tuple[float, float, float, float] = (0.72, 0.2, 0.95, 0.8)  # screen: beyond the arm's reach
+    wall_x: float = 0.5  # screen: x of the wall's middle
+    wall_height: float = 0.5  # screen: from the floor to the top of the wall
+    wall_thickness: float = 0.02  # screen: from the left to the right side of the wall
+    arm_base: tuple[float, float] = (0.33, 0.5)  # screen: x and y of the base: thesis, appendix A
     arm_pixels: float = 300.0  # total length: thesis, appendix A
-    arm_start: tuple[float, float] = (180.0, 360.0)  # degrees, each joint: thesis, appendix A
+    arm_start: tuple[float, float] = (180.0, 360.0)  # first angles of joints in degrees: thesis, appendix A
     arm_ball_angle: tuple[float, float] = (75.0, 105.0)  # degrees: thesis, appendix A
     arm_ball_radius: tuple[float, float] = (0.75, 1.0)  # share of the arm's length: thesis, appendix A
 
@@ -85,7 +85,7 @@ class WorldConfig:
             value = getattr(self, name)
             if value != int(value):
                 raise ValueError(f"{name} must be a whole number, got {value}")
-            object.__setattr__(self, name, int(value))  # 4.0, as from a file, counts as 4
+            object.__setattr__(self, name, int(value))  # a whole float, such as 4.0 from a file, is accepted
 
     def fastest_ball(self, thrown: float) -> float:
         """Returns an upper bound on the speed of a ball, in meters a second.
@@ -189,7 +189,7 @@ TASKS: dict[str, Task] = {
             effector="hand",
             start="held",
             wall=True,
-            goal_sigma=0.1,  # behind the wall, fewer goals around a goal can be reached
+            goal_sigma=0.1,  # behind the wall, fewer of the goals around a goal can be reached
             summary="throw a held ball over a wall",
         ),
         Task(

@@ -18,7 +18,7 @@ from torchrl_her_envs.common.seeding import as_seeds, uniform
 from torchrl_her_envs.toy.goals import LatticeGoals
 from torchrl_her_envs.toy.pictures import WIDTH, Sheet, draw
 
-MOST_STEPS = (1 << 20) - 1  # most steps of an episode: random numbers are reserved for them
+MOST_STEPS = (1 << 20) - 1  # most steps of an episode, since random numbers are reserved for each step
 
 
 @dataclass

@@ -11,7 +11,7 @@ from torchrl_her_envs.toy.base import ToyEnv, check_flag, check_whole
 from torchrl_her_envs.toy.goals import LatticeGoals
 from torchrl_her_envs.toy.pictures import Sheet, draw_bits
 
-_MOST_BITS = 127  # a start takes 2 * bits + 1 random numbers, of the 256 that a step has
+_MOST_BITS = 127  # most bits: a start takes 2 * bits + 1 of the 256 random numbers of a step
 
 
 class BitFlip(ToyEnv):

@@ -25,7 +25,7 @@ class LatticeGoals:
         [0.0, 0.5, 1.0]
     """
 
-    is_box = False  # the points of a box, not all of it
+    is_box = False  # goals are lattice points of a box, not the whole box
 
     def __init__(self, low: Sequence[float], high: Sequence[float], *, count: int) -> None:
         self.low = torch.tensor(low, dtype=torch.float64)

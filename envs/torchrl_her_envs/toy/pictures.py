@@ -15,7 +15,7 @@ from torchrl_her_envs.common.rendering.colors import FAILURE, INK, MARGIN, SUCCE
 WIDTH = 300  # default width in pixels
 _HEIGHT = 0.6  # height of a picture, as a fraction of its width
 _FINER = 2  # factor by which pictures are drawn larger, for smooth edges
-_MOST_CELLS = 400  # links of a chain up to which they are drawn one by one
+_MOST_CELLS = 400  # number of links of a chain up to which each link is drawn
 _LIGHT: Color = (252, 251, 248)
 _HAT: Color = (58, 56, 62)
 _FACE: Color = (246, 205, 160)

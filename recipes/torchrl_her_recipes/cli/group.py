@@ -114,7 +114,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     environments, notices = logging.getLogger("torchrl_her_envs"), _Notices()
     environments.addHandler(notices)
     environments.setLevel(logging.INFO)
-    logging.getLogger("torch.utils.cpp_extension").setLevel(logging.ERROR)  # no warning of missing CUDA
+    logging.getLogger("torch.utils.cpp_extension").setLevel(logging.ERROR)  # hides a warning of missing CUDA
     try:
         with warnings.catch_warnings():
             warnings.showwarning = say_warning

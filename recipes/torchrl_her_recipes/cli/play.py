@@ -87,7 +87,7 @@ def _film_of(source: Path, *, compared: bool) -> Path:
     if source.is_dir():
         return source / name
     if source == recipes.RunFolder(source.parent).policy and source.is_file():
-        return source.with_name(name)  # not policy.gif, which is the video that the run made at its end
+        return source.with_name(name)  # never policy.gif, which is the video made at the end of the run
     stem = source.stem if source.is_file() else file_name(str(source))
     return source.with_name(f"{stem}{'_compare' * compared}.gif")
 

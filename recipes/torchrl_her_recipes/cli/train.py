@@ -60,7 +60,7 @@ def train(
         click.echo(f"run: {resume}")
         _say_finished(recipes.RunFolder(resume), changes)
         return _say_end(recipes.resume(resume, options=changes))
-    runs = requests(options, multirun=multirun)  # all are checked before the first one starts
+    runs = requests(options, multirun=multirun)  # all recipes are checked before the first run starts
     if show:
         documents = [yaml.safe_dump(recipe.to_dict(), sort_keys=False) for recipe in runs.values()]
         click.echo("---\n".join(documents), nl=False)

@@ -22,10 +22,10 @@ from torchrl_her_recipes.config.resolve import TERMINATION, EnvFacts, auto_optio
 
 _AT_ONCE = 8
 _STEPS = 3_000
-_SELDOM = 0.5  # share of episodes in which the achieved goal changes: Panda's tasks have 0.15 to 0.35
-_FACTS: dict[str, EnvFacts] = {}  # cache, by task
-_SECONDS = 20.0  # no further episodes begin after this time
-_FUTURE = 16  # later goals of an episode that each transition is tried with
+_SELDOM = 0.5  # share of episodes below which the achieved goal changes seldom: 0.15 to 0.35 in Panda's tasks
+_FACTS: dict[str, EnvFacts] = {}  # cached facts of each task
+_SECONDS = 20.0  # seconds after which no further episodes begin
+_FUTURE = 16  # number of later goals of the episode that each transition is tried with
 _DIGITS = 1e-4  # two rewards with at most this relative difference count as equal
 _TOUCH = 0.1  # quantile of distances while the object moves that counts as touch; farther away it may roll
 _NEAR = 0.5  # a hand is nearer to a moving object than this share of its usual distance
@@ -189,7 +189,7 @@ def _facts(
         after = outcomes(rule, goals, episode["next"])
         some_kept.append(_kept(before, goals, meets))
         if not episode["next", "done"][-1]:
-            continue  # unfinished, since the number of steps was reached
+            continue  # unfinished: the look ended before the episode
         moved.append(not bool(meets(before[:1], goals).all()))
         achieved.append(bool(meets(after, episode["next", "desired_goal"]).any()))
         last = episode["next"][-1:]

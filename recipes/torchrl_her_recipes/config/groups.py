@@ -200,7 +200,7 @@ class HindsightConfig(Group):
         check_strategy(self.strategy)
         if self.goal_sources not in (None, AUTO):
             object.__setattr__(self, "goal_sources", check_goal_sources(self.goal_sources))
-        elif (self.k, self.strategy) != (4, "future"):  # given by the user, in place of auto
+        elif (self.k, self.strategy) != (4, "future"):  # k or strategy was given, which replaces auto
             object.__setattr__(self, "goal_sources", None)
 
     @property
@@ -248,7 +248,7 @@ class CurriculumConfig(Group):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.name != "task" and self.stages is None:  # so that a saved recipe does not depend on the file
+        if self.name != "task" and self.stages is None:  # a saved recipe must not depend on the file
             object.__setattr__(self, "stages", _read_stages(Path(self.name)))
         stages = self.stages
         if stages is not None and not (

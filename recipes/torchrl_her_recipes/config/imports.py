@@ -19,9 +19,9 @@ from torchrl_her_envs.registry import GYM, module_of
 # Modules that any ``gym:module:ID`` may import. ``module:function`` may not: it could call any function.
 _HARMLESS = ("gymnasium", "gymnasium_robotics", "torchrl_her_envs")
 
-_imported: list[str] = []  # modules that worker processes import, too
+_imported: list[str] = []  # names of modules that worker processes must import, too
 _permitted: set[str] = set()
-_everything: list[bool] = []  # has an entry while all modules are permitted
+_everything: list[bool] = []  # not empty while all modules are permitted
 
 
 def import_modules(names: Sequence[str]) -> None:

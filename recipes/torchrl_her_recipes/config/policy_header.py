@@ -11,7 +11,7 @@ from torchrl_her_recipes.config.plain_files import naming, shown
 POLICY_SUFFIX = ".safetensors"
 METADATA_KEY = "torchrl_her"
 
-_LARGEST_HEADER = 1 << 22  # bytes
+_LARGEST_HEADER = 1 << 22  # largest size of a header in bytes
 
 
 def read_header(path: Path) -> dict[str, Any]:

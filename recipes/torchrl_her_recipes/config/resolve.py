@@ -18,7 +18,7 @@ _WARMUP = 1_000  # least number of environment steps before the first gradient s
 _EPISODES = 100  # episodes in an epoch if environments are stepped one by one
 # Options that algo=auto sets if it chooses a curriculum and goals have equal weights
 _AT_ONCE = {"order": "all_at_once", "every_stage": True, "task_share": 1.0}
-_STAGE_EPOCHS = 10  # value of stage_epochs that algo=auto sets otherwise
+_STAGE_EPOCHS = 10  # value of stage_epochs that algo=auto sets if goals have weights
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -44,7 +44,7 @@ FORMER_NAMES = {
 }
 # groups that had options before, and the groups that have them now
 FORMER = {"ibs": ("weights", "behavior"), "novelty": ("weights",), "curriculum": ("order",)}
-# groups whose options have no short names: ``file`` alone would be unclear
+# groups whose options need the group's name: ``file`` alone would be unclear
 LONG_ONLY = ("demonstrations",)
 
 
@@ -191,7 +191,7 @@ def place(values: Mapping[str, Any], base: Nested | None = None) -> Nested:
                 placed.setdefault(group, {})[key] = each
             continue
         if value is None and "name" in names.get(name, []):
-            continue  # task=null: the default
+            continue  # a null name, as in task=null, means the default
         if name == "curriculum" and isinstance(value, list | tuple):
             placed.setdefault("curriculum", {})["stages"] = list(value)
             continue

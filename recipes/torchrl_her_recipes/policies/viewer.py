@@ -69,7 +69,7 @@ class Viewer:
                     raise ValueError(f"{policy.source} cannot be filmed: its environment renders no pictures")
                 self._episodes.append(LiveEpisodes(env, policy, size=size))
             self._opened = opened.pop_all()
-        self._before = [Seen(0, 0)] * len(self._episodes)  # counts of earlier episodes
+        self._before = [Seen(0, 0)] * len(self._episodes)  # counts of the episodes before the current ones
         self._round = -1
 
     def __enter__(self) -> Self:

@@ -18,7 +18,7 @@ except ImportError as error:  # these large packages are in an extra, since only
     raise ImportError("reports need the package arch: pip install '.[report]'") from error
 
 REPETITIONS = 2_000
-_SIZE = 0.95  # coverage of the intervals
+_SIZE = 0.95  # coverage of the confidence intervals
 _CUT = 0.25  # fraction of the runs that is cut off at each end
 
 

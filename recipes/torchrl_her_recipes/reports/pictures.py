@@ -21,7 +21,7 @@ from torchrl_her_recipes.reports.results import Combination
 from torchrl_her_recipes.runs.plots import Rows, band, colors, draw_curves, draw_goals
 
 _MIME = {".svg": "image/svg+xml", ".png": "image/png", ".gif": "image/gif", ".mp4": "video/mp4"}
-_WIDTH, _HEIGHT = 4.4, 3.9  # size in inches, narrow enough that letters are readable on a phone
+_WIDTH, _HEIGHT = 4.4, 3.9  # size in inches, narrow enough that text is readable on a phone
 _INK = "#1a202c"
 
 

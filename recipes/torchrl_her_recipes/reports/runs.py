@@ -15,7 +15,7 @@ from torchrl_her_recipes.reports.tidy import Results
 from torchrl_her_recipes.studies.seed_batches import Batches
 
 _FILMS = (".gif", ".mp4")
-_LARGEST = 20_000_000  # largest size in bytes of a film that is embedded in the page
+_LARGEST = 20_000_000  # largest size in bytes of a video that is embedded in the page
 
 
 def read_runs(folders: Sequence[Path]) -> Results:

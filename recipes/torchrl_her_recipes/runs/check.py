@@ -8,9 +8,9 @@ from torchrl_her_recipes.components.first_look import Facts, resolved
 from torchrl_her_recipes.config.algorithms import Algorithm
 from torchrl_her_recipes.config.recipe import Recipe
 
-_SELDOM = 0.5  # fraction of the episodes; the achieved goal changes seldom if it changes in fewer
+_SELDOM = 0.5  # fraction of the episodes below which a change of the achieved goal is seldom
 _UNLIKE = 100  # ratio of scales above which observations need normalization
-_SLOW = 5e-3  # seconds; an environment is slow if a step takes longer, which a gradient step hardly does
+_SLOW = 5e-3  # seconds of a step above which an environment is slow; a gradient step is hardly slower
 _MOSTLY = 0.5  # fraction of achieved goals above which success says little about learning
 _ROUNDED = 0.005  # fraction below which a percentage would be rounded to 0%
 

@@ -28,7 +28,7 @@ def soft_interrupt() -> Iterator[Callable[[], None]]:
         >>> with soft_interrupt() as check:
         ...     check()  # raises Interrupted after Ctrl-C
     """
-    pressed: list[float] = []  # times of signals
+    pressed: list[float] = []  # times at which signals arrived
 
     def check() -> None:
         if pressed:

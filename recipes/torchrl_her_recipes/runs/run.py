@@ -248,7 +248,7 @@ class _Run:
         hooks, view = [*callbacks, *loggers], RunView(self.components, trainer, rows, home)
         threads = torch.get_num_threads()
         torch.set_num_threads(recipe.run.threads)
-        torch.set_flush_denormal(True)  # denormal moments of Adam, of unused weights, are ten times slower
+        torch.set_flush_denormal(True)  # unused weights have denormal moments in Adam, ten times slower
         display = Progress(trainer, epochs=recipe.run.epochs, frames=recipe.total_frames, show=progress)
         interrupted = stopped = saved = False
         with soft_interrupt() as check, ExitStack() as opened:  # also defers Ctrl-C while files are saved
@@ -258,7 +258,7 @@ class _Run:
             def on_batch(_trainer: Trainer) -> None:
                 display.batch()
                 check()
-                stops = [hook.on_batch(view) for hook in hooks]  # all are called, even if one returns True
+                stops = [hook.on_batch(view) for hook in hooks]  # every hook is called, even if one is True
                 if any(stops):
                     raise Stopped
 

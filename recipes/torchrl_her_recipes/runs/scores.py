@@ -9,8 +9,8 @@ from typing import Any
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-LAST = 3  # number of evaluations, the last ones, whose mean is the result of a run
-_SCORED = 5  # number of evaluations, the last ones, whose mean is the score of a run in searches
+LAST = 3  # number of last evaluations whose mean is the result of a run
+_SCORED = 5  # number of last evaluations whose mean is the score of a run in searches
 
 
 def at_the_end(rows: Sequence[dict[str, float]], name: str, *, evaluations: int = LAST) -> list[float]:

@@ -60,7 +60,7 @@ def parts_of(components: Components, trainer: Trainer) -> dict[str, Any]:
             set_stage_goals(buffer.writer, state.progress.stage_of(run), run=run)
 
     def begin_episodes(_state: dict[str, Any]) -> None:
-        if trainer.in_epoch:  # new episodes, since the state of these environments cannot be saved
+        if trainer.in_epoch:  # new episodes begin, since the environments' states are not saved
             collector.reset()
             if isinstance(buffer.writer, HERWriter):
                 buffer.writer.end_episodes()

@@ -113,7 +113,7 @@ class RayWorkers:
         while self._tasks:
             for task in list(self._tasks.values()):
                 ray.cancel(task, force=True)
-            time.sleep(0.1)  # until run() has returned
+            time.sleep(0.1)  # waits until run() has returned
         self._leave()
 
 

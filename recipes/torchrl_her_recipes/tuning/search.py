@@ -39,7 +39,7 @@ from torchrl_her_recipes.tuning.results import DEFAULT, folder_of, write_picture
 _NAME, _SETTINGS, _DATABASE = "search", "search.yaml", "search.db"
 _TICK = 1.0  # seconds between two checks of running trials
 _ATTEMPTS = 3  # largest number of attempts at a trial whose process dies
-_FAILURES = 5  # a search ends if its first trials, this number of them, all fail: options cannot be the cause
+_FAILURES = 5  # number of first trials that end a search if all fail: their options are not the cause
 _ATTEMPT, _REPEATED, _PRUNED, _ERROR = "attempt", "repeated", "pruned", "error"
 
 
@@ -174,7 +174,7 @@ def _begin(search: Search, database: Path) -> Study:
 def _storage(database: Path) -> RDBStorage:
     optuna.logging.set_verbosity(optuna.logging.WARNING)
 
-    def connect() -> sqlite3.Connection:  # by the path: in a URL, some of its characters have a meaning
+    def connect() -> sqlite3.Connection:  # not by a URL, in which characters of the path have a meaning
         return sqlite3.connect(database, timeout=60, check_same_thread=False)
 
     return RDBStorage("sqlite:///search.db", engine_kwargs={"creator": connect})

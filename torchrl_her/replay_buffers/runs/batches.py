@@ -13,7 +13,7 @@ from torchrl_her.replay_buffers.keys import TransitionKeys
 from torchrl_her.replay_buffers.runs.written import take_rows
 from torchrl_her.replay_buffers.streams import BY_ENV, find_streams, in_order
 
-_NO_ROWS = TensorDict(batch_size=[0])  # made once, as most batches hold nothing back; it is never written to
+_NO_ROWS = TensorDict(batch_size=[0])  # made once, since most batches hold no rows back; never written to
 
 
 @dataclass(frozen=True)

@@ -142,7 +142,7 @@ def _join(episodes: Episodes, shares: list[_Share]) -> Piece:
     """Joins episodes of different runs to a piece."""
     horizon = max(share.horizon for share in shares)
     first, last = shares[0], shares[-1]
-    if last.begin + last.number - first.begin == sum(share.number for share in shares):  # without a gap
+    if last.begin + last.number - first.begin == sum(share.number for share in shares):  # shares without gaps
         span = slice(first.begin, last.begin + last.number)
         rows, lengths = episodes.rows[span], episodes.lengths[span]
     else:

@@ -71,7 +71,7 @@ class RecentGoals:
             return self
         out, lengths, achieved = dict(self.goals), episodes.lengths, entry_of(rows, keys.next_achieved)
         for name, size in sizes.items():
-            if name == "actual":  # one goal of each episode
+            if name == "actual":  # the desired goal of each episode
                 number, goals, row = torch.ones_like(lengths), keys.asked_for(rows), episodes.rows[:, 0]
             else:
                 number, goals, row = lengths, achieved, episodes.rows[episodes.inside]
@@ -116,7 +116,7 @@ def _last(before: Tensor | None, new: Tensor, size: int) -> Tensor | None:
     if len(new) == 0:
         return before
     if len(new) > size:
-        # New goals are ordered by environment, so the last ones would be from few environments only.
+        # New goals are ordered by environment, so the last ones would come from few environments.
         return new[spread_evenly(len(new), size, new.device)]
     if before is None:
         return new.clone()  # a view would keep the whole batch in memory

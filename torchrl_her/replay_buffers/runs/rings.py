@@ -54,7 +54,7 @@ class Rings:
         end, moves = begin + count, []
         cursor = (self.cursors[run] + max(0, count - capacity)) % capacity
         begin = max(begin, end - capacity)
-        while begin < end:  # up to the block's end, then on from its start
+        while begin < end:  # writes up to the block's end, then continues at its start
             number = min(end - begin, capacity - cursor)
             first = run * capacity + cursor
             moves.append(Move(slice(begin, begin + number), slice(first, first + number)))

@@ -21,7 +21,7 @@ from torchrl_her.torchrl_private import generator_of
 class _BlockSampler(StateFile, Sampler):
     """Sampler of a storage that is R equal blocks of rows, one block for each run."""
 
-    capacity: int  # rows of a block
+    capacity: int  # number of rows in the block of each run
     runs: int
     generators: list[torch.Generator] | None
     _home: torch.device

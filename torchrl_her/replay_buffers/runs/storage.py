@@ -14,7 +14,7 @@ from torchrl.data.replay_buffers.storages import LazyTensorStorage, TensorStorag
 
 from torchrl_her.torchrl_private import count_a_write, set_last_written, set_length, whole_of
 
-_ALIGNED = 8  # bytes: rows begin at a multiple of it, so that numbers of any type can be read in place
+_ALIGNED = 8  # alignment of rows in bytes, so that numbers of any type can be read in place
 
 
 class Field(NamedTuple):
@@ -151,7 +151,7 @@ def write_slices(storage: TensorStorage, rows: TensorDictBase, moves: Sequence[M
     """Writes rows [m] into a storage of one dimension, slice by slice, and updates its length."""
     entries = dict(rows.items(True, True))
     kept = dict(whole_of(storage).items(True, True)) if storage.initialized else {}
-    if kept.keys() != entries.keys():  # also the first time, when the storage is made
+    if kept.keys() != entries.keys():  # also at the first write, which makes the storage
         for move in moves:
             storage.set(move.to, rows[move.source], set_cursor=False)
     else:  # entry by entry: slicing a tensordict takes longer than copying it
@@ -182,7 +182,7 @@ def layout(rows: TensorDictBase) -> tuple[Field, ...]:
         return ()
     out: list[Field] = []
     begin = 0
-    # The largest types first, so that each is aligned; then by key, so that the layout is always the same.
+    # Largest types come first, so that all are aligned; keys are sorted, so that the layout never varies.
     for key, entry in sorted(entries, key=lambda pair: (-pair[1].itemsize, _path(pair[0]))):
         size = entry[0].numel() * entry.itemsize
         out.append(Field(key, entry.dtype, entry.shape[1:], begin, begin + size))

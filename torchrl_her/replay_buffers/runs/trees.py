@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl_her.native.trees import load_trees
 
 _FAN = 16  # children of a node: 64 bytes, one cache line
-_TOPS = 32  # nodes without a parent, at most
+_TOPS = 32  # largest number of nodes at the top level, which have no parent
 
 
 class SumTrees:
@@ -151,7 +151,7 @@ def _descend(sums: Tensor, mass: Tensor) -> tuple[Tensor, Tensor]:
 
     The running sums of the children are [..., c]. A child of value 0 is never taken, unless all are 0.
     """
-    total = sums[..., -1:]  # rounding may have made it less than the mass
+    total = sums[..., -1:]  # may be less than the mass because of rounding
     within = torch.minimum(mass.to(sums.dtype), torch.nextafter(total, torch.zeros_like(total)))
     child = (sums <= within).sum(-1, keepdim=True).clamp_max_(sums.shape[-1] - 1)
     before = sums.gather(-1, (child - 1).clamp_min_(0)).masked_fill_(child == 0, 0.0)

@@ -167,7 +167,7 @@ def _by_row(chunk: Chunk, numbers: Tensor) -> Tensor:
 def _windows(chunk: Chunk, source: Tensor) -> tuple[Tensor, Tensor]:
     """Returns positions [V, m] of up to n steps from each transition on, and which are in its episode."""
     episodes = chunk.episodes
-    real = episodes.rows[episodes.inside]  # one episode after the other: a place is a position in here
+    real = episodes.rows[episodes.inside]  # rows by episode; a place is a position in this list
     place = _by_row(chunk, torch.arange(len(real), device=real.device))
     end = episodes.lengths.cumsum(0)[_episode_numbers(episodes)]
     places, inside = windows(place[source], end[place[source]], chunk.options.n_steps)
@@ -207,7 +207,7 @@ def join_rows(
     changed = list(dict.fromkeys(key for written in both for key in written.changes))
     same = rows.exclude(*exclude, *changed)
     root = join([written.root for written in both])
-    if all(written.last is written.root for written in both):  # transitions of single steps
+    if all(written.last is written.root for written in both):  # all transitions are single steps
         out = take_rows(same, root)
     else:
         out = take_rows(same.exclude("next"), root)

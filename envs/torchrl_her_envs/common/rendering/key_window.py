@@ -11,7 +11,7 @@ import numpy as np
 
 _SHOW_NOTHING = ("dummy", "offscreen")  # drivers that SDL falls back to if there is no display
 _DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")
-_LEAST = 160  # least side of a window, in pixels
+_LEAST = 160  # least width and height of a window, in pixels
 _NO_DISPLAY = (
     "a window needs a display, and there is none{reason}: work where there is one (over ssh: ssh -Y), or "
     "write a film with --out FILE.mp4"

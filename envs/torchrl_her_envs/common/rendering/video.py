@@ -19,8 +19,8 @@ try:
 except ImportError:  # only MP4 needs it
     imageio = None
 
-_COLORS = 255  # colors of a GIF; the last of 256 is transparent, for unchanged pixels
-_SAMPLES = 12  # frames that a GIF's colors are chosen from
+_COLORS = 255  # number of colors of a GIF; the last of 256 is transparent, for unchanged pixels
+_SAMPLES = 12  # number of frames from which a GIF's colors are chosen
 
 
 def write_video(frames: Sequence[Tensor], path: str | Path, *, fps: float = 25) -> Path:
@@ -100,7 +100,7 @@ def _shared_palette(frames: Sequence[Tensor]) -> Image.Image:
     which = torch.linspace(0, len(frames) - 1, min(_SAMPLES, len(frames))).round().long().tolist()
     sample = _image(torch.cat([frames[index] for index in which]))
     counted = sample.getcolors(maxcolors=sample.width * sample.height) or []
-    # A color counts by the root of its area: else backgrounds take the whole palette, and balls turn gray.
+    # Colors are weighted by the root of their area: else backgrounds fill the palette, and balls turn gray.
     weighted = [color for count, color in counted for _ in range(math.isqrt(count))]
     return _image(torch.tensor([weighted], dtype=torch.uint8)).quantize(_COLORS, Image.Quantize.MEDIANCUT)
 

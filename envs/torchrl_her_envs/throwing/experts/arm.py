@@ -15,8 +15,8 @@ from torchrl_her_envs.throwing.experts.inverse_kinematics import nearest_turn, t
 from torchrl_her_envs.throwing.tasks import WorldConfig
 
 _SPEEDS = 9  # number of speeds of each joint, from full speed one way to full speed the other way
-_LONGEST_SWING = 16  # steps, in which a joint turns by up to 147 degrees
-_READY = (math.radians(120.0), 0.0)  # stretched up and back: from around here all goals can be thrown at
+_LONGEST_SWING = 16  # number of steps of the longest swing, in which a joint turns by up to 147 degrees
+_READY = (math.radians(120.0), 0.0)  # joint angles, up and back: throws from around here reach all goals
 
 
 class ArmSkill:
@@ -86,5 +86,5 @@ def _steps_to_column(gap: Tensor, speed: Tensor, world: WorldConfig) -> Tensor:
     """Returns the whole steps [..., 2] before and after a ball crosses a horizontal gap in meters."""
     steps = (
         gap / (speed.clamp(min=1e-3) * world.time_step)
-    ).floor()  # a ball that moves left never crosses it
+    ).floor()  # a ball that moves left never crosses the gap
     return torch.stack((steps, steps + 1), -1).clamp(1, LONGEST_FLIGHT)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchrl_her_envs.throwing.tasks import WorldConfig
 
-LONGEST_FLIGHT = 30  # time steps that controllers look ahead: in 1.2 s a ball falls from top to bottom
+LONGEST_FLIGHT = 30  # number of steps that controllers look ahead: in 1.2 s a ball falls from top to bottom
 
 
 def fallen(substeps: Tensor, world: WorldConfig) -> Tensor:

@@ -18,9 +18,9 @@ from torchrl_her_envs.throwing.experts.clearance import will_hit
 from torchrl_her_envs.throwing.experts.hand import HandSkill
 from torchrl_her_envs.throwing.tasks import Task, WorldConfig
 
-_CHUNK = 16  # plans made at once: each compares thousands of throws, and all should fit into the cache
+_CHUNK = 16  # number of plans made at once, whose thousands of throws should fit into the cache
 _PLANNED = 0.8  # share of the threshold by which a planned throw may miss the goal
-_LET_GO = 0.9  # the same share on release; it is larger, so that rounding never spoils a plan
+_LET_GO = 0.9  # share of the threshold by which a throw may miss on release; the margin is for rounding
 
 
 class Skill(Protocol):

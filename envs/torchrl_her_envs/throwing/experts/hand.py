@@ -77,7 +77,7 @@ def _aims(goal: Tensor, world: WorldConfig, *, within: float) -> Tensor:
 
 def _steps_to(gap: Tensor, stride: float) -> Tensor:
     """Returns the steps of a hand for a way [..., 2], with at most ``stride`` a step in each direction."""
-    return (gap.abs().amax(-1) / stride - 1e-3).ceil()  # rounding may leave a thousandth of a stride
+    return (gap.abs().amax(-1) / stride - 1e-3).ceil()  # a thousandth of a stride may be rounding
 
 
 def _can_throw(start: Tensor, velocity: Tensor, hand: Effector, world: WorldConfig, *, wall: bool) -> Tensor:

@@ -15,7 +15,7 @@ Point = tuple[float, float]
 
 MARGIN = 0.04  # margin on each side, as a fraction of the screen, for a hand at the edge and for the floor
 OVERSAMPLING = 3  # factor by which pictures are drawn larger and then scaled down, for smooth edges
-SMALLEST = 32  # pixels: smaller pictures would show nothing
+SMALLEST = 32  # least side of a picture in pixels: smaller ones would show nothing
 
 
 def to_pixel(point: Point, size: int) -> tuple[int, int]:

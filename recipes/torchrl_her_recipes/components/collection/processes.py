@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from torchrl_her_recipes.components.collection.ray_workers import NodeWorkers
 
 _ON_RAY = "torchrl_her_recipes.components.collection.ray_workers:NodeWorkers"
-_SECONDS = 1.0  # between two checks that all processes are alive
+_SECONDS = 1.0  # seconds between two checks that all processes are alive
 _FAILED = "a process failed: worker {} (exit code {})"
 _TRACEBACK = "Worker traceback:"  # TorchRL's message repeats ``__cause__`` below this line
 _EXIT_PRIORITY = 100  # high enough to end the processes before multiprocessing waits for them at exit
@@ -64,7 +64,7 @@ class SyncWorkers(MultiSyncCollector):
     """Collector whose processes collect each batch together; row k always belongs to the same environment."""
 
     def __init__(self, *args: Any, **options: Any) -> None:
-        self._thread = ThreadPoolExecutor(1, thread_name_prefix="collection")  # waits for batches
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="collection")  # thread that waits for batches
         self._batch: Future[TensorDictBase] | None = None  # the batch that is being collected
         super().__init__(*args, cat_results="stack", **options)
 
@@ -78,7 +78,7 @@ class SyncWorkers(MultiSyncCollector):
     def ahead(self, weights: TensorDictBase) -> None:
         """Starts collecting the next batch with these weights of the policy, if it was not started before."""
         if self._batch is None:
-            self.update_policy_weights_(weights)  # while no process reads the shared weights
+            self.update_policy_weights_(weights)  # now, while no process reads the shared weights
             self._batch = self._thread.submit(self.next)
 
     def take(self, weights: TensorDictBase) -> TensorDictBase:
@@ -104,7 +104,7 @@ class AsyncWorkers(MultiAsyncCollector):
         return self.num_workers  # TorchRL's default is 1, but a process drops its batch if the queue is full
 
     def begin(self, beginnings: Sequence[Beginning]) -> None:
-        if self.running:  # take the batches under way, which would else be returned after the reset
+        if self.running:  # discard old batches, which would else be returned after the reset
             for _ in range(self.num_workers):
                 _get(self._get_from_queue, self.procs)
             self.running, self._iterator = False, None
@@ -228,13 +228,13 @@ class ProcessCollector(BaseCollector):
             return start(processes=config.processes, sync=config.sync)
         _check_main_script(f"processes={config.processes}")
         kind = SyncWorkers if config.sync else AsyncWorkers
-        with _interrupts_later():  # else Ctrl-C at this moment prints a traceback for each process
+        with _interrupts_later():  # else Ctrl-C during the start prints a traceback for each process
             workers = kind(
                 [make] * config.processes,
                 _to_send(self.policy),
                 frames_per_batch=frames * (config.processes if config.sync else 1),
                 total_frames=-1,
-                device="cpu",  # for environments, policy and storage
+                device="cpu",  # device of environments, policy and storage
                 collector_class=WorkerCollector,
                 exploration_type=ExplorationType.RANDOM,
                 num_threads=torch.get_num_threads(),  # TorchRL sets this number in the main process

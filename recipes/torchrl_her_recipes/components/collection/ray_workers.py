@@ -17,7 +17,7 @@ from torchrl.envs.utils import ExplorationType
 from torchrl_her_recipes.components.collection.cluster import join, one_line, resource
 from torchrl_her_recipes.components.collection.worker import Beginning, NodeCollector
 
-_SECONDS = 1.0  # between two checks that the cluster still has nodes
+_SECONDS = 1.0  # seconds between two checks that the cluster still has nodes
 _DEATHS = 3  # largest number of deaths of a process between two of its batches; one more ends the run
 _ON_A_CORE = {"num_cpus": 1, "num_gpus": 0, "scheduling_strategy": "SPREAD"}
 
@@ -64,11 +64,11 @@ class NodeWorkers(RayCollector):
             raise ValueError(
                 f"processes={processes} need a core each, but {free} of the cluster's {cores} are free"
             )
-        self._orders: dict[int, ray.ObjectRef] = {}  # by process, the batch that it is collecting
+        self._orders: dict[int, ray.ObjectRef] = {}  # for each process, the batch that it is collecting
         self._beginnings: list[Beginning] = []
         self._to_begin: set[int] = set()  # processes whose next batch must begin with new episodes
         self._lives = [1] * processes
-        self._deaths = [0] * processes  # since the last batch of each process
+        self._deaths = [0] * processes  # number of deaths of each process since its last batch
         self._make_env = make_env
         try:
             super().__init__(
@@ -81,7 +81,7 @@ class NodeWorkers(RayCollector):
                 exploration_type=ExplorationType.RANDOM,
                 remote_configs=_ON_A_CORE,
                 sync=sync,
-                weight_sync_schemes={},  # TorchRL's would wait for a node that has died
+                weight_sync_schemes={},  # TorchRL's schemes would wait for a node that has died
             )
         except RayError as error:
             raise RuntimeError(f"a process that collects cannot start: {one_line(error)}") from error

@@ -68,7 +68,7 @@ def begin_process() -> None:
     if hasattr(os, "setpgrp"):
         # Ctrl-C and signals to a process group must reach only the main process, which ends the others.
         os.setpgrp()
-    torch.set_flush_denormal(True)  # as in the main process
+    torch.set_flush_denormal(True)  # denormals are slow; also set in the main process
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,7 @@ class NodeCollector(WorkerCollector):
     """
 
     def __init__(self, *args: Any, **options: Any) -> None:
-        torch.set_flush_denormal(True)  # as in the main process
+        torch.set_flush_denormal(True)  # denormals are slow; also set in the main process
         torch.set_num_threads(1)
         self._error = ""  # error of the constructor, if any
         try:

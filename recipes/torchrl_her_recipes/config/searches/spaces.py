@@ -160,7 +160,7 @@ def _checked_choice(name: str, values: Any) -> list[Any]:
 
 
 def _distribution(*, kind: str, low: Any = 0, high: Any = 0, values: Sequence[Any] = ()) -> BaseDistribution:
-    from optuna import distributions  # noqa: PLC0415  (an extra)
+    from optuna import distributions  # noqa: PLC0415  (imported here, since it is in an extra)
 
     if kind == "choice":
         return distributions.CategoricalDistribution(values)

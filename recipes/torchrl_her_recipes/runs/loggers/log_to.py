@@ -193,7 +193,7 @@ def _(logger: TensorboardLogger, name: str, path: Path, step: int) -> None:
 
 @show_file.register
 def _(logger: WandbLogger, name: str, path: Path, step: int) -> None:
-    import wandb  # noqa: PLC0415  (an extra)
+    import wandb  # noqa: PLC0415  (imported here, since it is in an extra)
 
     media = wandb.Video(str(path), format="gif") if path.suffix == ".gif" else wandb.Image(str(path))
     logger.log_metrics({name: media}, step=step)
@@ -201,7 +201,7 @@ def _(logger: WandbLogger, name: str, path: Path, step: int) -> None:
 
 @show_file.register
 def _(logger: MLFlowLogger, _name: str, path: Path, _step: int) -> None:
-    from mlflow import MlflowClient  # noqa: PLC0415  (an extra)
+    from mlflow import MlflowClient  # noqa: PLC0415  (imported here, since it is in an extra)
 
     client = MlflowClient(logger.log_dir)  # TorchRL stores the address of the MLflow server in ``log_dir``
     client.log_artifact(logger.experiment.info.run_id, str(path), "pictures")
