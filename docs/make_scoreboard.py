@@ -98,10 +98,13 @@ def boards() -> dict[str, list[Curves]]:
             theirs("RHER", "FetchPickAndPlace", "Relay-HER"),
             theirs("DDPG+HER", "FetchPickAndPlace", "DDPG and HER, by Relay-HER's authors"),
         ],
-        **{
-            task: [ours(f"default agent on {task}", "default agent, `epsilon_decay=0.99`")]
-            for task in ("PandaPush", "PandaPickAndPlace")
-        },
+        "PandaPush": [
+            ours("default agent on PandaPush", "default agent"),
+            ours("epsilon decays by 0.99 on PandaPush", "the same, `epsilon_decay=0.99`"),
+        ],
+        "PandaPickAndPlace": [
+            ours("default agent on PandaPickAndPlace", "default agent, `epsilon_decay=0.99`")
+        ],
     }
 
 
