@@ -95,7 +95,10 @@ def in_stage(
 
 
 def _until_first(end: Tensor, demonstrations: Demonstrations) -> tuple[Tensor, Tensor]:
-    """Returns the rows [m] up to each episode's first ``end`` (a mask [n]), and the counts of these [E]."""
+    """Cuts each episode after its first row that ``end`` [n] marks.
+
+    Returns the kept rows [m], and the number of rows that each episode keeps [E].
+    """
     episode, rows = demonstrations.episode, torch.arange(len(end))
     first = torch.full_like(demonstrations.lengths, len(end))
     first = first.scatter_reduce(0, episode[end], rows[end], "amin")

@@ -22,8 +22,8 @@ from torch import Tensor, nn
 _STEPS = 1 << 22  # largest number of opcodes of a pickle: checking them takes a few hundred megabytes
 _DEPTH = 100
 _REPEATED = 1 << 24  # number of elements by which tensors, as expanded views, may exceed their storages
-# Last bytes of an archive by torch.save: size and offset of the directory, and offset of its end record.
-# If these contradict each other, zipfile and torch may read different directories.
+# Last bytes of a zip archive by torch.save: size and offset of its list of files, and where the archive's
+# last record begins. If these contradict each other, zipfile and torch may read different lists.
 _END = struct.Struct("<4s36xQQ4s4xQ4x4s16xH")
 _MARKS = (b"PK\6\6", b"PK\6\7", b"PK\5\6")
 # torch ignores case in the names of records, so the names that hold tensors must be numbers.

@@ -14,9 +14,9 @@ from torch import Tensor
 class EpisodeIndex:
     """Index of the episodes in a ring buffer: converts rows of the storage to places in episodes, and back.
 
-    A row is a stored transition, a stream the rows of one environment, and a run a stretch of rows of one
-    stream that belong to the same episode without a break. Each row has a *position*, in the order of streams
-    and then time, and a *place*: in the order of places, all rows of an episode follow each other.
+    A row is a stored transition. A stream is all rows of one environment. A run is a stretch of a stream
+    whose rows belong to one episode without a break. Each row has a *position*, its index if rows are sorted
+    by stream and then by time, and a *place*, its index if all rows of an episode follow each other.
 
     Attributes:
         slots: T, the number of filled slots of the ring.

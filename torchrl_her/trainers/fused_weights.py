@@ -98,7 +98,7 @@ class FusedWeights:
                 fits = tensor.shape == parameter.shape and tensor.dtype == self._dtype
                 if not (fits and tensor.device.type == "cpu" and tensor.is_contiguous()):
                     raise ValueError(
-                        "a parameter's target and moments must be like it, contiguous and on the CPU, "
+                        "a parameter and its target and moments must be contiguous tensors on the CPU, "
                         f"{self._dtype} of shape {list(parameter.shape)}; got {tensor.dtype} of shape "
                         f"{list(tensor.shape)} on {tensor.device}: make the learner after moving the loss, "
                         "and load states of the same networks"

@@ -421,7 +421,7 @@ def test_states_of_other_networks_are_refused() -> None:
     small, large = (make_learner(FusedLearner, make_loss("ddpg", hidden=hidden)) for hidden in (2, 64))
     small.update(make_rows("ddpg", (1, 8)))
     large.optimizer.load_state_dict(small.optimizer.state_dict())
-    with pytest.raises(ValueError, match=r"target and moments must be like it"):
+    with pytest.raises(ValueError, match=r"target and moments must be contiguous tensors on the CPU"):
         large.update(make_rows("ddpg", (1, 8)))
 
 

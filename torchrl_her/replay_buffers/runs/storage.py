@@ -40,7 +40,7 @@ class PackedStorage(LazyTensorStorage):
     Drawing a row then takes one access to memory, and not one for each entry, which makes it many times as
     fast: rows are drawn from all over a storage that is larger than any cache. Entries that are read are
     views of the drawn rows, so their memory is not contiguous. Everything else is as in
-    ``LazyTensorStorage``. It stores data that cannot be packed as its parent does: entries that are no
+    ``LazyTensorStorage``, which also stores what cannot be packed: entries that are no
     tensors, nested tensordicts that are empty or have another batch size, and tensors instead of tensordicts.
     If later rows have new entries, the storage is copied once to pack these, too.
 
