@@ -175,11 +175,11 @@ def draw_curves(curves: Curves, path: Path, *, title: str) -> None:
     figure = Figure(figsize=(9.4, 3.8), layout="constrained")
     panels = figure.subplots(1, 2, sharey=True)
     for axes, field in zip(panels, ("frames", "seconds"), strict=True):
-        for name, color in zip(curves, ("#2b6cb0", "#dd6b20", "#2f855a", "#805ad5"), strict=False):
-            for seed, curve in enumerate(curves[name]):
+        for number, (name, runs) in enumerate(curves.items()):
+            for seed, curve in enumerate(runs):
                 label = name if seed == 0 else None
                 places = [getattr(point, field) for point in curve]
-                axes.plot(places, [point.success for point in curve], color=color, label=label)
+                axes.plot(places, [point.success for point in curve], color=f"C{number}", label=label)
         axes.set(
             xlabel="environment steps" if field == "frames" else "seconds of training", ylim=(-0.02, 1.02)
         )
@@ -193,8 +193,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--preset", help="of torchrl-her (default: HER on hand_v0)")
-    parser.add_argument("--task", help="the default agent on this task, in place of a preset")
+    ask = parser.add_mutually_exclusive_group()
+    ask.add_argument("--preset", help="of torchrl-her (default: HER on hand_v0)")
+    ask.add_argument("--task", help="the default agent on this task, in place of a preset")
     parser.add_argument("--only", nargs="+", choices=CONTENDERS, default=["this", "Stable-Baselines3"])
     parser.add_argument("--aim", type=float, default=0.8, help="success at which a run ends")
     parser.add_argument("--noise", type=float, default=0.1, help="of Stable-Baselines3's actions")
@@ -210,8 +211,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
     values: dict[str, Any] = load_preset(options.preset) if options.preset else HAND
-    values = {"task": {"name": options.task}} if options.task else values
+    if options.task:
+        values = {"task": {"name": options.task}}
     seeds = range(options.first_seed, options.first_seed + options.repeats)
+    limits = {"aim": options.aim, "window": options.window, "minutes": options.minutes}
     asked = {"epochs": options.epochs, "epoch_frames": options.epoch_frames}
     asked = {name: value for name, value in asked.items() if value is not None}
     kept = options.curves and options.curves.with_suffix(".csv")
@@ -220,7 +223,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
         recipe = make_recipe(values, seed=seed, **asked)
         for name in options.only:
             if (name, seed) not in runs:
-                limits = {"aim": options.aim, "window": options.window, "minutes": options.minutes}
                 runs[name, seed] = race(name, recipe, noise=options.noise, **limits)
                 if kept:
                     write_runs(runs, kept)
