@@ -29,8 +29,8 @@ can be compared with the collected one.
 ## Collectors
 
 A learner extends its buffer with what a collector yields. Environments with a batch dimension are called
-batched. The writer takes batches [N, T] as they are. For the unit they are flattened, `batch.reshape(-1)`, or
-go into a storage with `ndim=2`, called [T, N] here. With `replay_buffer=` the collector itself writes.
+batched. The writer takes batches [N, T] as they are. `HERSampleUnit` needs `batch.reshape(-1)`, or a storage
+with `ndim=2`, called [T, N] here. With `replay_buffer=` the collector itself writes.
 
 Each cell was tried in three ways: with trajectory ids, which collectors write by default; with the ids of the
 transform [`EnvIds`](replay_buffers.md), too; and without ids. A cell that does not mention ids is the same in

@@ -59,14 +59,14 @@ REFUSALS: dict[str, Refusal] = {
     ),
     "consuming": Refusal(
         "consumes its transitions",
-        "New transitions take the places of sampled ones, in no order of time.",
+        "New transitions take the places of sampled ones, so rows are not in order of time.",
     ),
     "one dimension": Refusal(
-        "HERWriter needs a storage of 1 dimension", "The writer writes to storages of one dimension."
+        "HERWriter needs a storage of 1 dimension", "The writer needs a storage of one dimension."
     ),
     "no list": Refusal(
         "HERSampleUnit needs a storage of tensordicts",
-        "The unit reads the whole storage as one tensordict to find goals.",
+        "`HERSampleUnit` reads the whole storage as one tensordict to find goals.",
     ),
     "list storage": Refusal(
         "slices.*LazyTensorStorage",
@@ -74,11 +74,11 @@ REFUSALS: dict[str, Refusal] = {
     ),
     "2-D slices": Refusal(
         "PrioritizedSliceSampler.*dimension",
-        "TorchRL's prioritized slices are no sequences there once the storage is full.",
+        "In a full storage, TorchRL's prioritized slices are not consecutive steps.",
     ),
     "ensemble": Refusal(
         "in a ReplayBufferEnsemble, relabel while writing",
-        "An ensemble samples without the units of its members. Use `HERWriter`.",
+        "An ensemble does not use the sample units of its members. Use `HERWriter`.",
     ),
     "2-D writes": Refusal(
         "dim0 and dim1 must be within the range",
@@ -103,7 +103,7 @@ REFUSALS: dict[str, Refusal] = {
     ),
     "2-D consuming": Refusal(
         "ConsumingSampler only supports 1-dimensional storages",
-        "Consuming needs a storage of one dimension.",
+        "A consuming sampler needs a storage of one dimension.",
         ours=False,
     ),
     "ensemble weights": Refusal(
