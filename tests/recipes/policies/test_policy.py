@@ -31,7 +31,8 @@ from ...envs.gym.walk import Walk
 from ..small import Refused, small
 from .tiny import needs_onnx, states, tiny_policy
 
-OTHERS = {"fetch_push": "", "fetch_pick_and_place": "", "panda_pick_and_place": "panda_gym"}  # and modules
+_FETCH, _PANDA = ("fetch_push", "fetch_pick_and_place"), ("panda_push", "panda_pick_and_place")
+OTHERS = dict.fromkeys(_FETCH, "") | dict.fromkeys(_PANDA, "panda_gym")  # and modules that they need
 
 
 def backwards() -> list[dict[str, Any]]:
