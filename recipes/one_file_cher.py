@@ -65,7 +65,7 @@ class Options:
     # Hindsight
     k: int = 4  # virtual goals per transition
     capacity: int = 1_000_000  # number of real and virtual transitions in the replay buffer
-    priority_alpha: float = 0.3  # exponent of the squared TD error: equals 0.6 in Schaul et al.
+    priority_alpha: float = 0.3  # exponent of the squared TD error (in Schaul et al.: 0.6, of the error)
     priority_beta: float = 0.4
     # Curriculum
     window: int = 20  # greedy episodes whose mean success is compared with success_threshold
@@ -76,9 +76,9 @@ class Options:
     learning_rate: float = 1e-3
     gamma: float = 0.98
     tau: float = 0.02
-    action_penalty: float = 0.3  # keeps the actor's tanh from its ends, where the gradient vanishes
+    action_penalty: float = 0.3  # keeps the actor's tanh away from -1 and 1, where its gradient vanishes
     max_grad_norm: float = 3.0
-    ema_decay: float = 0.9995  # decay of the moving average of weights, which is evaluated
+    ema_decay: float = 0.9995  # decay of the moving average of the actor's weights; the average is evaluated
     # Exploration: a fraction epsilon of the actions explores; a fifth of these are uniform, the others noisy
     epsilon_decay: float = 0.9  # factor by which epsilon shrinks after each epoch
     epsilon_end: float = 0.05
@@ -94,7 +94,7 @@ class Evaluation(NamedTuple):
 
 
 def make_stages() -> CurriculumProgress:
-    """Returns the progress through the stages of ``hand_v1`` (reach, then throw), at the first stage."""
+    """Makes the curriculum of ``hand_v1`` (reach, then throw); its progress begins at the first stage."""
     task = make_env("hand_v1")
     width = task.observation_spec["state"].shape[-1]
     stages = [CurriculumStage(**stage) for stage in task.stages()]
@@ -105,7 +105,7 @@ def make_staged_env(progress: CurriculumProgress, num_envs: int, seed: int) -> E
     """Makes environments that show the observation and goals of the current stage.
 
     ``StateToObs`` reads observation and goals from the state, and rewards achieving the stage's goal.
-    ``ZeroPad`` writes the networks' ``input``, in which each entry of the state has the same place in all
+    ``ZeroPad`` writes the networks' ``input``, in which each entry of the state has the same index in all
     stages, and entries that the stage does not use are 0.
     """
     stages = StateToObs(progress.curriculum, progress), ZeroPad(progress.curriculum, progress)
@@ -184,7 +184,7 @@ def train(options: Options) -> Iterator[Evaluation]:
     for epoch in range(1, options.epochs + 1):
         while frames < epoch * options.epoch_frames:
             batch = collector.next()
-            buffer.extend(batch)  # writes finished episodes: each transition with its own and k virtual goals
+            buffer.extend(batch)  # writes finished episodes, each transition with real and k virtual goals
             frames += batch.numel()
             if frames < options.warmup_frames:
                 updates = frames // options.frames_per_update

@@ -84,7 +84,7 @@ def group(context: click.Context) -> None:
 
 def _permit(context: click.Context, _parameter: click.Parameter, given: bool) -> None:
     if given:
-        context.with_resource(allow_imports())  # permits imports until the command ends
+        context.with_resource(allow_imports())  # until the command ends, files may name modules to import
 
 
 _may_import = click.option(
@@ -133,7 +133,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BAD_INPUT_ERRORS as error:
         return fail(one_line(error))
     except RuntimeError as error:
-        # Messages of torch's allocators, on a GPU and on a CPU; torch is not imported for every command.
+        # Torch's errors of full memory: known by type on a GPU and by text on a CPU, without importing torch.
         if type(error).__name__ != "OutOfMemoryError" and "Allocator" not in str(error):
             raise
         return fail(f"there is not enough memory: {one_line(error).rpartition('Allocator: ')[2]}")

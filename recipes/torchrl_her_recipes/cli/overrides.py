@@ -1,4 +1,4 @@
-"""Parses ``NAME=VALUE`` arguments of the command line, whose values are YAML, or several for a sweep."""
+"""Parses ``NAME=VALUE`` arguments of the command line: VALUE is YAML, or a list of values for a sweep."""
 
 from __future__ import annotations
 

@@ -48,11 +48,11 @@ def study(
     ray: str | None,
     gpus_per_job: float,
 ) -> int:
-    """Train the study NAME, of `torchrl-her list` or a .yaml file. The same command resumes the study."""
+    """Train a study: NAME is one in `torchrl-her list`, or a .yaml file. The same command resumes it."""
     if jobs is not None and ray is not None:
         raise click.UsageError("--jobs and --ray cannot be given together")
     if gpus_per_job and ray is None:
-        raise click.UsageError("--gpus-per-job needs --ray: on one machine, jobs share its GPUs as they are")
+        raise click.UsageError("--gpus-per-job needs --ray: without it, all jobs share this machine's GPUs")
     loaded = load_study(name, seeds=seeds, frames=frames, quick=quick)
     home = folder or Path("runs") / (loaded.name + ("_quick" if quick else ""))
     to_do = recipes.plan_study(loaded, home)
@@ -100,7 +100,7 @@ def report(names: tuple[str, ...], folder: Path | None, out: Path | None, tidy: 
     if home.is_dir() and names[0] not in study_names():
         return _report_runs([Path(name) for name in names], folder, out, tidy)
     if len(names) > 1:
-        raise ValueError(f"a page is about one study or about folders of runs, got {', '.join(names)}")
+        raise ValueError(f"give the name of one study or folders of runs, got {', '.join(names)}")
     loaded = load_study(names[0])
     home = folder or Path("runs") / loaded.name
     if not home.is_dir():

@@ -92,7 +92,7 @@ def _sweep(requested: dict[Path, Recipe], jobs: int | None, *, anew: bool) -> in
     """Trains several runs on all cores; if one fails, the others are still trained."""
     runs = {home.name: recipe for home, recipe in requested.items()}
     folder = next(iter(requested)).parent
-    if anew:  # the same command resumes an unfinished sweep
+    if anew:  # no folder is given: resumes an unfinished sweep of the same runs, if there is one
         folder = recipes.unfinished_sweep(runs, folder.parent) or folder
     plan, workers = recipes.plan_study(runs, folder), recipes.make_workers(jobs=jobs)
     click.echo(f"sweep: {len(plan.to_go)} of {len(runs)} runs to go: {folder}")

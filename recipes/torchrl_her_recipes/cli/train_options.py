@@ -37,7 +37,7 @@ def with_folder(options: tuple[str, ...], folder: str | None) -> tuple[str, ...]
 
 
 def requests(options: tuple[str, ...], *, multirun: bool) -> dict[Path, Recipe]:
-    """Returns the recipes of the runs that arguments describe, by the folders of the runs."""
+    """Returns the runs that arguments describe, as a dict from each run's folder to its recipe."""
     now = f"{datetime.now():%Y-%m-%d_%H-%M-%S}"
     if not multirun:
         values = single(options)
@@ -57,7 +57,7 @@ def requests(options: tuple[str, ...], *, multirun: bool) -> dict[Path, Recipe]:
 
 
 def single(options: tuple[str, ...]) -> dict[str, Any]:
-    """Returns the values of arguments by name; raises a ValueError if one has several values, for a sweep."""
+    """Returns the values of arguments by name; raises a ValueError if an argument has several values."""
     pairs = _pairs(options)
     for name, text in pairs:
         if name != "folder" and len(split_sweep(text)) > 1:
@@ -105,7 +105,7 @@ class OptionsCommand(click.Command):
 
 
 def _rows(group: str) -> Iterator[tuple[str, str]]:
-    """Yields each option of a group with its help; names the choices that have it if the default does not."""
+    """Yields a group's options with their help; an option that the default choice lacks names its choices."""
     if kind := KINDS.get(group):
         known = f"one of {', '.join(kind)}; `torchrl-her list` describes them"
         yield _written(group, "name", kind.default), known
@@ -133,7 +133,7 @@ def _written(group: str, name: str, default: Any) -> str:
 
 
 def complete(_context: click.Context, _parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    """Completes names of options (short or with their group), and values that are one of several names."""
+    """Completes names of options (short or with their group), and values of options with a list of names."""
     options = option_names()
     name, equals, begun = incomplete.partition("=")
     if equals:

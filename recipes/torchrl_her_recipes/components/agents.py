@@ -83,7 +83,7 @@ def shape_of(
     *,
     rewards: tuple[float, float] = (-1.0, 0.0),
 ) -> AgentShape:
-    """Returns what networks need to fit an environment: keys and widths of inputs, actions, and rewards."""
+    """Returns the shape of an environment's networks: inputs and their widths, actions, range of rewards."""
     in_keys = ("observation", "desired_goal") if curriculum is None else ("input",)
     return AgentShape(
         task=task,
@@ -96,7 +96,7 @@ def shape_of(
 
 
 def find_learner(options: LearnerConfig, shape: AgentShape) -> type[LearnerConfig]:
-    """Returns the class of learner options; for "auto", DDPG or DQN, as actions are continuous or discrete.
+    """Returns the learner's class of options; "auto" is DDPG for continuous and DQN for discrete actions.
 
     Raises:
         ValueError: the learner does not support the task's kind of actions or several runs side by side, or

@@ -100,7 +100,7 @@ class Components(Agent):
         return policy if place_of(policy) == place else deepcopy(policy).to(place)
 
     def learner(self) -> Learner:
-        """Makes the learner, whose gradient steps are compiled if possible, or else call the loss module.
+        """Makes the learner. It compiles gradient steps if possible, and otherwise calls the loss module.
 
         On the CPU, gradient steps are compiled to C++. On a GPU they are recorded as CUDA graphs; with
         ``compile=always``, they pass through ``torch.compile`` first.

@@ -1,4 +1,4 @@
-"""Makes the curriculum of a recipe, the progress of its runs, and the transforms of environments for both."""
+"""Makes a recipe's curriculum, the progress of runs through it, and transforms that apply a run's stage."""
 
 from __future__ import annotations
 
@@ -89,8 +89,8 @@ def _read_stage(options: Any, env: GoalEnv, *, is_last: bool) -> CurriculumStage
     try:
         if is_last and "threshold" in options:
             raise ValueError(
-                f"stage {options.get('name')!r}: threshold has no effect in the last stage, whose goals the "
-                "environment judges; leave it out"
+                f"stage {options.get('name')!r}: threshold has no effect in the last stage, where the "
+                "environment decides if goals are achieved; leave it out"
             )
         return CurriculumStage(**options, rewards=reward_range(env))
     except TypeError as error:  # options are missing or unknown, or ``options`` is not a mapping

@@ -141,8 +141,8 @@ def _check(every: Demonstrations, file: str, task: str, env: EnvBase) -> None:
     base: Any = goal_env(env)
     if base.info_keys:
         raise ValueError(
-            f"demonstrations hold no info, and rewards of {task} read it (task.options.info_keys): leave one "
-            "of them out"
+            f"rewards of {task} read info (task.options.info_keys), which demonstrations do not have: leave "
+            "out the demonstrations"
         )
     for key in ("observation", "achieved_goal", "desired_goal"):
         width, got = base.observation_spec[key].shape[-1], every.rows[key].shape[-1]

@@ -66,7 +66,7 @@ class TaskEnvs:
     Attributes:
         task: Task and its options.
         dtype: Name of the type of observations and rewards.
-        gamma: Discount factor, for the return of never achieving the goal, which is the reward of a failure.
+        gamma: Discount factor. The reward of a failure is the discounted return of never achieving the goal.
         curriculum: Options of the curriculum; None without a curriculum.
     """
 

@@ -22,14 +22,14 @@ from torchrl_her_recipes.config.resolve import TERMINATION, EnvFacts, auto_optio
 
 _AT_ONCE = 8
 _STEPS = 3_000
-_SELDOM = 0.5  # share of episodes below which the achieved goal changes seldom: 0.15 to 0.35 in Panda's tasks
+_SELDOM = 0.5  # goals change seldom if a smaller share of episodes changes them; Panda: 0.15 to 0.35
 _FACTS: dict[str, EnvFacts] = {}  # cached facts of each task
 _SECONDS = 20.0  # seconds after which no further episodes begin
 _FUTURE = 16  # number of later goals of the episode that each transition is tried with
 _DIGITS = 1e-4  # two rewards with at most this relative difference count as equal
-_TOUCH = 0.1  # quantile of distances while the object moves that counts as touch; farther away it may roll
-_NEAR = 0.5  # a hand is nearer to a moving object than this share of its usual distance
-_PAIRS = 32  # number of pairs of goals from which the distance of achieved goals is estimated
+_TOUCH = 0.1  # quantile of the hand's distances in steps that move the object; nearer hands touch it
+_NEAR = 0.5  # a touching hand is nearer to the object than this share of its distance in other steps
+_PAIRS = 32  # number of pairs of goals to estimate the distance below which a goal is achieved
 _HALVINGS = 20
 
 Meets = Callable[[Outcome, Tensor], Tensor]
@@ -47,7 +47,7 @@ class Facts:
         scales: the least and the greatest standard deviation of entries of the observation.
         disagree: share of steps, except failures, whose reward differs from that of ``compute_reward``.
         achieved: share of the episodes in which the goal was achieved.
-        moved: share of the episodes with a goal that the first state had not achieved, by the reward.
+        moved: share of the episodes that achieve a goal that their first state does not achieve.
         kept: share of transitions with a later goal of the episode that the filter keeps.
         fallen: share of the episodes that terminated without the goal, as by a fall.
         constant: entries of the observation that never changed.
@@ -109,7 +109,7 @@ def resolved(recipe: Recipe) -> Recipe:
 
 
 def _watched(envs: TaskEnvs) -> TaskEnvs:
-    """Returns a maker of environments that keep rewards of failures and, if open, watch ends at goals."""
+    """Returns ``envs`` with the environment's rewards of failures and, for ``termination=auto``, its ends."""
     ends = {TERMINATION: "watch"} if ends_open(envs.task) else {}
     options = {**(envs.task.options or {}), **ends} or None
     return replace(envs, task=replace(envs.task, options=options, failure="environment"))
@@ -118,8 +118,8 @@ def _watched(envs: TaskEnvs) -> TaskEnvs:
 def _needed_stages(facts: Facts, auto: bool) -> list[dict[str, Any]] | None:
     """Returns stages for a task, the same for each seed; None if none are found or needed.
 
-    A task in which episodes end in failures gets no stages, since a failure says nothing about the goals of
-    a lower stage. If ``algo`` is ``auto``, stages are needed only if chance seldom changes the achieved goal.
+    A task in which episodes end in failures gets no stages: a failure says nothing about the goals of an
+    earlier stage. If ``algo`` is ``auto``, stages are needed only if chance seldom changes the achieved goal.
     """
     return None if facts.fallen > 0 or (auto and facts.moved >= _SELDOM) else facts.stages or None
 
@@ -189,7 +189,7 @@ def _facts(
         after = outcomes(rule, goals, episode["next"])
         some_kept.append(_kept(before, goals, meets))
         if not episode["next", "done"][-1]:
-            continue  # unfinished: the look ended before the episode
+            continue  # the last episode, which was cut off
         moved.append(not bool(meets(before[:1], goals).all()))
         achieved.append(bool(meets(after, episode["next", "desired_goal"]).any()))
         last = episode["next"][-1:]
@@ -253,11 +253,11 @@ def _columns(observations: Tensor, goal: Tensor) -> list[int]:
 def propose_stages(rows: TensorDictBase, meets: Meets) -> list[dict[str, Any]]:
     """Proposes a curriculum of two stages: bringing the hand to the object, then the task itself.
 
-    The achieved goal is taken as the position of the object; the observation must contain it. The hand is g
-    neighboring entries of the observation that are nearer to the object in steps in which the object moves
-    than in other steps. The first stage is achieved if the hand touches the object. Fingers around the object
-    may come nearer than half of the distance at which the task's goals are achieved; in this case the
-    threshold of the first stage is half of that distance.
+    The achieved goal, g numbers, is taken as the object's position; the observation must contain it. The hand
+    is the g neighboring entries of the observation that are nearest to the object in steps that move it, and
+    farther away in other steps. The first stage is achieved if the hand touches the object. Fingers around
+    the object may come nearer than half of the distance at which the task's goals are achieved; in this case
+    the threshold of the first stage is half of that distance.
 
     Args:
         rows: transitions [n] of random actions.

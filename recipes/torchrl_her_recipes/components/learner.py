@@ -91,7 +91,7 @@ class LearnerBuilder(ABC):
 
     @property
     def bounds(self) -> tuple[float, float] | None:
-        """Least and greatest reward, from which the clamping of targets follows; None without clamping."""
+        """Least and greatest reward, by which targets are clamped; None if they are not clamped."""
         return self.shape.rewards if getattr(self.options, "clamp_targets", True) else None
 
     @abstractmethod
@@ -153,6 +153,6 @@ class LearnerBuilder(ABC):
         return {"start": options.epsilon_start, "decay": options.epsilon_decay, "end": options.epsilon_end}
 
     def action_noise(self) -> dict[str, float]:
-        """Returns those of the options for noise and uniform actions that the learner has."""
+        """Returns the options for noise and uniform actions, except options that the learner lacks."""
         names = {"noise": "action_noise", "uniform_share": "uniform_share"}
         return {to: getattr(self.options, name) for to, name in names.items() if hasattr(self.options, name)}

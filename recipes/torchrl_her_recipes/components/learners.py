@@ -121,7 +121,7 @@ class SACBuilder(DDPGBuilder):
 
     @property
     def bounds(self) -> tuple[float, float] | None:
-        """Least and greatest reward for clamping, or None; raises if rewards to clamp by have no bounds."""
+        """Least and greatest reward for clamping targets, or None; raises an error if they are infinite."""
         if self.options.clamp_targets and not all(map(math.isfinite, self.shape.rewards)):
             raise ValueError(
                 f"clamp_targets=true has no effect on {self.shape.task}, whose rewards have no bounds: "

@@ -56,7 +56,7 @@ ALGORITHMS: dict[str, Algorithm] = {
         _filtered("filtered_her_ibs", f"Filtered-HER that {_IBS}", weights="ibs"),
         Algorithm(
             "her_ibs_sequential",
-            "HER with weights q* alone; prioritized replay does the rest",
+            "HER that prefers goals of the task: weights q*; for prioritized replay",
             weights="ibs_sequential",
         ),
         _filtered("filtered_her_rare", f"Filtered-HER that {_RARE}", weights="rare"),

@@ -158,7 +158,7 @@ class ReplayConfig(Group):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.batch_size > self.buffer_size:
-            raise ValueError(f"batch_size={self.batch_size} must fit buffer_size={self.buffer_size}")
+            raise ValueError(f"batch_size={self.batch_size} must be at most buffer_size={self.buffer_size}")
 
 
 FUTURE_AND_ACTUAL = {"future": 3, "actual": 2}  # as "future-actual" goals of MRL (Pitis et al., 2020)
@@ -248,7 +248,7 @@ class CurriculumConfig(Group):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.name != "task" and self.stages is None:  # a saved recipe must not depend on the file
+        if self.name != "task" and self.stages is None:  # read at once: a saved recipe must not need the file
             object.__setattr__(self, "stages", _read_stages(Path(self.name)))
         stages = self.stages
         if stages is not None and not (

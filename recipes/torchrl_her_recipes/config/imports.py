@@ -16,7 +16,7 @@ from pathlib import Path
 
 from torchrl_her_envs.registry import GYM, module_of
 
-# Modules that any ``gym:module:ID`` may import. ``module:function`` may not: it could call any function.
+# ``gym:module:ID`` imports these without permission; ``module:function`` could call any of their functions.
 _HARMLESS = ("gymnasium", "gymnasium_robotics", "torchrl_her_envs")
 
 _imported: list[str] = []  # names of modules that worker processes must import, too

@@ -89,7 +89,7 @@ class Recipe:
         if num_envs != AUTO and proposed.goal_memory < num_envs:
             raise ValueError(
                 f"goal_memory={proposed.goal_memory} must be at least num_envs={num_envs}, "
-                "whose goals come at once"
+                "since all environments get goals at once"
             )
 
     @property
@@ -224,7 +224,7 @@ def _meant(group: str, *values: Nested) -> str:
 
 
 def _drop_options_of_other_choices(below: Nested, given: Nested) -> None:
-    """Drops options of the base that the choices the user requests do not have.
+    """Drops options of the base that do not exist in the choices that the user requests.
 
     If the user requests another choice than the base, defaults of the base's choice are dropped, too, since
     the requested choice may have other defaults.

@@ -68,7 +68,7 @@ _VALUES: dict[str, Callable[[Recipe, EnvFacts], Any]] = {
 
 
 def auto_options(recipe: Recipe) -> list[tuple[str, str]]:
-    """Returns group and name of each option whose value ``auto`` must be replaced and has an effect.
+    """Returns group and name of each option that is ``auto`` and has an effect: it must get a value.
 
     Example:
         >>> auto_options(Recipe().replace(gamma=0.95))[1:3]

@@ -77,7 +77,7 @@ def _field_names(kind: type[groups.Group]) -> list[str]:
 
 
 def chosen(group: str, *values: Nested) -> str:
-    """Returns the ``name`` (or ``algo``) of a group from the first values that set it, or its default."""
+    """Returns a group's ``name`` (or ``algo``): the first one set in ``values``, or else the default."""
     key = "algo" if group == "hindsight" else "name"
     if name := next(filter(None, (given.get(group, {}).get(key) for given in values)), None):
         return name

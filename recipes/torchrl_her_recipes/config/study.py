@@ -124,7 +124,7 @@ class Study:
         self._check_sets("cases", "by name, such as no_filter", re.compile(r"\w[\w.=+-]*").fullmatch)
         for case, options in self.cases.items():
             if long := _set_in(options, _LENGTHS):
-                raise ValueError(f"cases of {self.name} set {long[0]} in {case}: it must be the same in all")
+                raise ValueError(f"cases of {self.name} set {long[0]} in {case}: it must not differ by case")
         drawn = [self.figure] if isinstance(self.figure, str) else list(self.figure)
         if not drawn or not set(drawn) <= set(AXES):
             known = ", ".join(AXES)
@@ -191,7 +191,7 @@ def curve_label(label: str, recipe: Recipe) -> str:
 
 
 def _word(name: str, value: Any, values: Sequence[Any]) -> str:
-    """Returns a varied option's part of a name (``tau=0.05``); for mappings, the entries that differ."""
+    """Names a varied option's value in a combination (``tau=0.05``); for mappings, the differing entries."""
     if all(isinstance(each, Mapping) for each in values):
         entries = {key: [each.get(key) for each in values] for key in value}
         differing = {
@@ -251,7 +251,7 @@ def load_study(
 
 
 def _set_in(options: Mapping[str, Any], names: Iterable[str]) -> list[str]:
-    """Returns those of the options in ``names`` that ``options`` sets, as short names."""
+    """Returns the short names of the options in ``names`` that ``options`` sets."""
     places = {locate(name) for name in names}
     return [name for group, values in place(options).items() for name in values if (group, name) in places]
 

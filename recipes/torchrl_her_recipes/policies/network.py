@@ -82,7 +82,7 @@ def check_weights(builder: LearnerBuilder, weights: Mapping[str, Tensor]) -> Non
             f"{expected.get(odd, 'missing')}, got {shapes.get(odd, 'nothing')}"
         )
     if odd := [key for key, value in weights.items() if not value.isfinite().all()]:
-        raise ValueError(f"weights must be finite, got others in {odd[0]}")
+        raise ValueError(f"weights must be finite, got NaN or infinity in {odd[0]}")
 
 
 class ScaledActions(nn.Module):

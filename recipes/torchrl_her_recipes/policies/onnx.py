@@ -29,7 +29,7 @@ from torchrl_her_recipes.policies.network import TensorPolicy
 SUFFIX = ".onnx"
 TOLERANCE = 1e-5  # largest allowed difference of actions, relative to the largest action if it is above 1
 
-_OPSET = 18  # the lowest version that torch's exporter writes without conversion; in runtimes since 2023
+_OPSET = 18  # version of ONNX operators: the lowest that torch writes without conversion; of 2023
 
 
 def need_onnx() -> ModuleType:

@@ -201,7 +201,7 @@ class Policy(TensorDictModuleBase):
         action = self.module(TensorDict(inputs, batch))["action"].numpy()
         if self.info.discrete:
             return action, None
-        action = np.clip(action, np.array(self.info.low), np.array(self.info.high))  # by bounds in float64
+        action = np.clip(action, np.array(self.info.low), np.array(self.info.high))  # bounds are float64
         return (np.rint(action) if self.info.whole else action).astype(self.info.task_dtype), None
 
     def envs(self, number: int, *, seed: int = 0, pictures: bool = False) -> EnvBase:

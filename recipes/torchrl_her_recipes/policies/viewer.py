@@ -23,7 +23,7 @@ _HOLD = 25  # number of times that the last frame of a video is repeated
 
 
 class Seen(NamedTuple):
-    """Number of goals that a policy achieved, and number of its goals in all episodes that ended."""
+    """Number of goals that a policy achieved, and of all goals that it had, in ended episodes."""
 
     achieved: int
     goals: int

@@ -71,7 +71,7 @@ def play(
 
 def show(viewing: Viewing, window: KeyWindow) -> None:
     """Shows episodes in a window and handles keys, until the user closes the window."""
-    due = 0.0  # steps that should have been taken by now, a fraction more each time that keys are read
+    due = 0.0  # steps to take now; each loop, which also reads keys, adds a step or a fraction of one
     while not viewing.over:
         window.show(viewing.frame().numpy())
         rate, looks = viewing.rate, max(_LOOKS, viewing.rate)

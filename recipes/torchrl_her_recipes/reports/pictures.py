@@ -1,4 +1,4 @@
-"""Draws the pictures of a report, each panel in a file of its own, with texts for readers who cannot see."""
+"""Draws the pictures of a report, each panel in a file of its own, with alternative texts for the page."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def _final(
 
 
 def _goals(task: str, cells: Sequence[Combination], figures: Path) -> list[Picture]:
-    """Draws heat maps of the virtual goals of each algorithm and of their target; none for other tasks."""
+    """Draws heat maps of each algorithm's virtual goals and of their target, for throwing tasks only."""
     if task not in TASKS:
         return []  # only goals of the throwing tasks lie on a screen
     maps = {cell.algorithm: cell.goals for cell in cells if cell.goals is not None}

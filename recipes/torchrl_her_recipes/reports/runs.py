@@ -98,7 +98,7 @@ def _by_recipe(paths: Sequence[Path]) -> list[list[Path]]:
 
 
 def _labels(groups: Sequence[Sequence[Path]]) -> list[str]:
-    """Names groups by their first folders (without the seed, if there are several) or, if equal, by paths."""
+    """Names groups by their first folders (without the seed, if a group has several), or else by its path."""
     names = [
         re.sub(r"_s\d+(_\d+)?$", "", group[0].resolve().name) if len(group) > 1 else group[0].resolve().name
         for group in groups

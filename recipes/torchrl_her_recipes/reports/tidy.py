@@ -1,4 +1,4 @@
-"""Writes the results of a study to a few small files, from which they can be read without its runs."""
+"""Writes the results of a study to a few small files, which replace the folders of its runs."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def read_study(study: Study, folder: Path) -> Results:
 def write_results(
     study: Study, folder: Path, out: Path, *, command: str | Sequence[str] | None = None
 ) -> Path:
-    """Writes the results of a study to a few small files, from which its report can be made without the runs.
+    """Writes the results of a study to a few small files, which suffice to make its report without the runs.
 
     - ``runs.csv`` has a row for each run and evaluation: the combination (``label``, ``task``, ``algorithm``
       and the other options that the study varies), ``seed``, ``epoch``, ``frames`` and all metrics, with six
@@ -190,7 +190,7 @@ def _number(value: float | None) -> str:
 
 
 def _read_table(folder: Path) -> dict[str, list[dict[str, float]]]:
-    """Reads the table of runs; returns the rows of each combination by its label, by epoch and run."""
+    """Reads the table of runs; returns each combination's rows by its label, sorted by epoch and run."""
     path, packed = folder / _RUNS, folder / f"{_RUNS}.gz"
     if not path.is_file() and not packed.is_file():
         raise ValueError(f"{folder} has no {_RUNS}")

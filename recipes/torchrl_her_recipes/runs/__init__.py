@@ -1,1 +1,1 @@
-"""Runs: training, evaluation, checkpoints, and what they leave behind."""
+"""Runs: training, evaluation, checkpoints, and the files that a run writes."""

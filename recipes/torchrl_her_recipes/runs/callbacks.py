@@ -34,10 +34,8 @@ class Callback:
 
     ``on_batch`` and ``on_epoch`` can return True to stop the run. The run then writes its checkpoint,
     pictures and policy as at its end, and :func:`~torchrl_her_recipes.resume` can continue it. All callbacks
-    are
-        called
-    in order, even if an earlier one returns True. If a callback raises an error, the run ends at once, and
-    ``on_end`` is not called.
+    are called in order, even if an earlier one returns True. If a callback raises an error, the run ends at
+    once, and ``on_end`` is not called.
 
     Checkpoints do not contain callbacks. A callback that decides from ``rows`` alone decides the same when
     the run is resumed.

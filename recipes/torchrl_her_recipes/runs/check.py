@@ -8,9 +8,9 @@ from torchrl_her_recipes.components.first_look import Facts, resolved
 from torchrl_her_recipes.config.algorithms import Algorithm
 from torchrl_her_recipes.config.recipe import Recipe
 
-_SELDOM = 0.5  # fraction of the episodes below which a change of the achieved goal is seldom
+_SELDOM = 0.5  # achieved goals change seldom if a smaller fraction of the episodes changes them
 _UNLIKE = 100  # ratio of scales above which observations need normalization
-_SLOW = 5e-3  # seconds of a step above which an environment is slow; a gradient step is hardly slower
+_SLOW = 5e-3  # seconds of a step above which an environment is slow; a gradient step takes about as long
 _MOSTLY = 0.5  # fraction of achieved goals above which success says little about learning
 _ROUNDED = 0.005  # fraction below which a percentage would be rounded to 0%
 

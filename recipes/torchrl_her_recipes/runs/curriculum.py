@@ -39,7 +39,7 @@ def stage_success(
 
 
 def move_on(components: Components, state: CurriculumState, samples: Tensor, frames: int) -> list[str]:
-    """Moves runs on whose success ``samples`` [R, n] end their stage; returns a message for each of them."""
+    """Moves runs to the next stage if ``samples`` [R, n] of success end their stage; returns messages."""
     before, evaluations = state.progress.stages, state.progress.evaluations
     # Records at most ``window`` samples: more samples of one evaluation make a lucky streak more likely.
     moved = state.progress.record(samples[:, : state.progress.window])

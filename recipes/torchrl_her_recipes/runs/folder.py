@@ -199,7 +199,7 @@ class RunFolder:
 
 
 def remember(config: Path, task: str) -> None:
-    """Records that this user has trained the run of a ``config.yaml``, so that resuming needs no permission.
+    """Records that this user trained the run of ``config.yaml``: resuming it may import its task's module.
 
     Does nothing if the run's task names no module, or if the user's state directory cannot be written.
     """

@@ -68,7 +68,7 @@ class GoalMap:
 
 
 def goal_map(buffer: TensorDictReplayBuffer, target: torch.Tensor | None) -> GoalMap | None:
-    """Makes the map from the counts of a buffer's goal weights and q* [cells]; None if they do not count."""
+    """Makes the map from a buffer's goal weights, which count goals, and q* [cells]; None without counts."""
     counted = [weights for weights in buffer.writer.goal_weights if isinstance(weights, GoalHistogram)]
     if not counted or target is None:
         return None

@@ -14,7 +14,7 @@ from torchrl_her_recipes.config.recipe import Recipe
 
 Row = dict[str, float]  # row of the table of metrics: one epoch of one run
 
-_AT_BOUND = 0.99  # an action is at its bound beyond this fraction of the way from the middle of its range
+_AT_BOUND = 0.99  # an action beyond this fraction of its range, counted from the middle, is at its bound
 _NEARLY_ALL = 0.95  # fraction of the entries of all actions, or of virtual rows, that counts as nearly all
 _STREAK = 3  # epochs in a row that show a problem before it is reported
 _LONG = 5  # epochs in a row for problems that may pass by themselves

@@ -112,7 +112,7 @@ class Plan:
         return lines
 
     def about(self, jobs: Iterable[Job], at_once: int, text: str) -> str:
-        """Inserts the time until jobs are done for ``{}`` in a text; returns "" if it cannot be estimated."""
+        """Replaces ``{}`` in a text by the time until jobs are done; returns "" if the time is unknown."""
         seconds = self.wall_clock(jobs, at_once)
         return "" if math.isnan(seconds) else text.format(f"about {duration(seconds)}")
 

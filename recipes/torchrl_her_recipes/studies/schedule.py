@@ -60,7 +60,7 @@ def run_jobs(plan: Plan, workers: Workers, *, progress: bool = True) -> dict[str
 
 
 def outcome_of(future: Future[Outcome]) -> Outcome:
-    """Returns the outcome of a job; an error of the worker itself becomes an outcome that has failed."""
+    """Returns the outcome of a job; an error of the worker itself becomes a failed outcome."""
     error = future.exception()
     return future.result() if error is None else Outcome(error=" ".join(f"{error!r}".split()))
 

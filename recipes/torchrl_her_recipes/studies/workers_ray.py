@@ -36,7 +36,7 @@ _REPORT = 0.5  # seconds between two reports of a job's progress
 
 
 class RayWorkers:
-    """Workers on the nodes of a Ray cluster, one for each core; see ``Workers`` in ``workers_local``.
+    """Workers on the nodes of a Ray cluster, one for each core; see ``Workers`` in ``studies.workers``.
 
     If the node or the process of a job dies, Ray runs the job again, up to three times.
 

@@ -72,7 +72,7 @@ def importances(study: Study) -> dict[str, float]:
 
 
 def _in_space(study: Study) -> Study:
-    """Returns a study with the complete trials that have all options, which the first trial may not have."""
+    """Returns a study of the complete trials that have all options; the first trial may lack some."""
     done = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
     most = max((len(trial.params) for trial in done), default=0)
     inside = create_study(direction="maximize")

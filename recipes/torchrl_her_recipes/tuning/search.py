@@ -131,7 +131,7 @@ def tune(
     except (OptunaError, SQLAlchemyError) as error:
         cause = error.__cause__ or error
         why = " ".join(str(getattr(cause, "orig", cause)).split())
-        raise OSError(f"{home / _DATABASE} cannot be used ({why}); the same command resumes it") from error
+        raise OSError(f"{home / _DATABASE} cannot be used ({why}); to resume, repeat the command") from error
     finally:
         workers.close()
 
@@ -174,7 +174,7 @@ def _begin(search: Search, database: Path) -> Study:
 def _storage(database: Path) -> RDBStorage:
     optuna.logging.set_verbosity(optuna.logging.WARNING)
 
-    def connect() -> sqlite3.Connection:  # not by a URL, in which characters of the path have a meaning
+    def connect() -> sqlite3.Connection:  # not by a URL, where some characters of a path are special
         return sqlite3.connect(database, timeout=60, check_same_thread=False)
 
     return RDBStorage("sqlite:///search.db", engine_kwargs={"creator": connect})
@@ -268,7 +268,7 @@ class _TrialRuns:
         space, ranges = self.search.space, self.search.space.distributions()
         waiting = self.study.get_trials(deepcopy=False, states=(TrialState.WAITING,))
         if waiting and (default := waiting[0].user_attrs.get(DEFAULT)) is not None:
-            # This trial has the recipe's own values; Optuna must not draw others for those outside the space.
+            # This trial has the recipe's own values; Optuna must not change those that lie outside the space.
             ranges = {name: ranges[name] for name in space.inside(default)}
         trial = self.study.ask(ranges)
         try:
@@ -327,7 +327,7 @@ class _TrialRuns:
 
 
 class _Reporter(Callback):
-    """Callback that reports a trial's score to Optuna after each epoch, and stops a trial that it prunes."""
+    """Callback that reports a trial's score to Optuna each epoch, and stops the trial if Optuna prunes it."""
 
     def __init__(self, study: Study, number: int) -> None:
         self.study = study

@@ -41,7 +41,7 @@ from ..small import small
         ({"curriculum": "nowhere.yaml"}, "curriculum must be 'task' or a YAML file with a list of stages"),
         ({"sampler": "best"}, "sampler must be one of prioritized, uniform, got 'best'"),
         ({"threshold": -0.1}, "threshold must be above 0, got -0.1"),
-        ({"batch_size": 256, "buffer_size": 100}, "batch_size=256 must fit buffer_size=100"),
+        ({"batch_size": 256, "buffer_size": 100}, "batch_size=256 must be at most buffer_size=100"),
         (
             {"processes": 3, "num_envs": 64, "epoch_frames": 6_400},
             "num_envs=64 cannot be shared out among processes=3: it must be a multiple of it",

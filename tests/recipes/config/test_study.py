@@ -131,7 +131,7 @@ def test_mappings_are_named_by_what_differs() -> None:
         ),
         (
             {"cases": {"long": {"run": {"epochs": 3}}}},
-            "cases of own set epochs in long: it must be the same in all",
+            "cases of own set epochs in long: it must not differ by case",
         ),
         ({"vary": {"k": 3}}, "vary of own must hold lists of values by option"),
         ({"vary": {"k": [1]}, "figure": "speed"}, "figure of own must be some of success"),

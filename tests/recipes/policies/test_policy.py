@@ -237,7 +237,7 @@ def test_without_the_extra_nothing_is_written(
         ),
         (
             lambda own: own["weights"]["module.layers.3.bias"].fill_(torch.nan),
-            "weights must be finite, got others in module.layers.3.bias",
+            "weights must be finite, got NaN or infinity in module.layers.3.bias",
         ),
         (
             lambda own: own["recipe"]["learner"].update(warp=9),

@@ -101,7 +101,7 @@ def test_what_was_not_trained_is_one_line(tmp_path: Path, refused: Refused) -> N
         ([str(home), str(tmp_path / "none")], "none is no folder of a run"),
         ([str(home), "--folder", "x"], "--folder goes with the name of a study"),
         ([str(home), "--export", "x"], "--export goes with the name of a study"),
-        (["bias", str(home)], "a page is about one study or about folders of runs, got bias, "),
+        (["bias", str(home)], "give the name of one study or folders of runs, got bias, "),
         ([str(home), "--follow"], "no option --follow; choose `tensorboard --logdir runs`"),
     ):
         assert message in refused("report", *arguments)

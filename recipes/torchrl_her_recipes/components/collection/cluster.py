@@ -48,7 +48,7 @@ def join(address: str) -> bool:
 
 @contextmanager
 def _signals_kept() -> Iterator[None]:
-    """Restores the handler of SIGTERM after the block: Ray's own would end a run without saving it."""
+    """Restores the handler of SIGTERM after the block: Ray's handler would end a run without saving it."""
     before = signal.getsignal(signal.SIGTERM)
     yield
     if threading.current_thread() is threading.main_thread():

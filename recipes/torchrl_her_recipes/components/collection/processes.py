@@ -53,7 +53,7 @@ _EXIT_PRIORITY = 100  # high enough to end the processes before multiprocessing 
 
 
 class CheckedWeightSync(SharedMemWeightSyncScheme):
-    """Sends weights in shared memory. If a process has ended, raises an error; its base class would hang."""
+    """Sends weights in shared memory; raises an error, instead of hanging, if a process has ended."""
 
     def _wait_for_ack(self, worker_ids: object = None, timeout: float | None = None) -> None:
         for queue in self._ack_queues.values():
@@ -91,7 +91,7 @@ class SyncWorkers(MultiSyncCollector):
 
     def _shutdown_main(self, timeout: float | None = None) -> None:
         super()._shutdown_main(timeout)
-        self._thread.shutdown(wait=False)  # a thread cannot wait for itself, and this may run in it
+        self._thread.shutdown(wait=False)  # without waiting: this may run in that thread itself
 
 
 class AsyncWorkers(MultiAsyncCollector):
@@ -131,7 +131,7 @@ class ProcessCollector(BaseCollector):
     same environment. After :meth:`collect_ahead` they collect the next batch while the caller learns from
     the last one. The policy that acts in such a batch is always one batch old, and the same seed gives the
     same batches. With ``sync=false`` no process waits for another: a batch [R * E / N, T] comes from the
-    process that finishes first, and its rows carry ids of their environments.
+    process that finishes first, and each row has the id of its environment.
 
     With ``ray=ADDRESS`` the processes run on the nodes of a Ray cluster, see
     :class:`~torchrl_her_recipes.components.collection.ray_workers.NodeWorkers`.
@@ -207,7 +207,7 @@ class ProcessCollector(BaseCollector):
 
     def set_seed(self, seed: int, static_seed: bool = False) -> int:
         """Raises an error: the recipe's seed determines all random numbers."""
-        raise NotImplementedError("seeds of processes that collect are those of the recipe: set its seed")
+        raise NotImplementedError("collecting processes take their seeds from the recipe: set its seed")
 
     def state_dict(self) -> OrderedDict:
         """Returns the number of resets, which with the seeds determines all later random numbers."""
@@ -278,7 +278,7 @@ class ProcessCollector(BaseCollector):
 
 
 def _check_main_script(asked: str) -> None:
-    """Raises an error if the main script has no ``__name__`` guard: processes import it and would train."""
+    """Raises an error if the main script has no ``__name__`` guard: processes import it, and would train."""
     path = getattr(sys.modules["__main__"], "__file__", None)
     if path is None or multiprocessing.get_start_method(allow_none=True) == "fork":
         return
@@ -323,8 +323,8 @@ def _in_blocks(batch: TensorDictBase, runs: int) -> TensorDictBase:
 def _to_send(policy: TensorDictModuleBase) -> TensorDictModuleBase:
     """Returns a copy of a policy on the CPU, which can be sent to other processes.
 
-    The copy has no random generators: each process makes its own, and a policy with two generators cannot be
-    sent.
+    The copy has no random generators: each process makes its own, and several generators cannot be sent to
+    another process.
     """
     copy = deepcopy(policy).to(CPU)
     for module in drawing_modules(copy):

@@ -86,7 +86,7 @@ class Beginning:
     progress: dict[str, Any] | None = None
 
     def again(self, life: int) -> Beginning:
-        """Returns a copy with new seeds, for a process that replaces a dead one; ``life`` counts these."""
+        """Returns a copy with new seeds for a process that replaces a dead one, for the ``life``-th time."""
         return replace(
             self,
             env_seeds=[derive_seed(seed, life) for seed in self.env_seeds],
@@ -106,7 +106,7 @@ def derive_seed(*numbers: int) -> int:
 
 
 class WorkerCollector(Collector):
-    """Collector in a process. A reset gives it new seeds, so that a resumed run repeats its numbers."""
+    """Collector in a process. Each reset sets all seeds, so a resumed run draws the same random numbers."""
 
     def begin(self, beginning: Beginning) -> None:
         """Begins new episodes in all environments, with the given seeds and stages."""

@@ -57,7 +57,7 @@ def make_behavior(
 
 
 def make_asking(seeds: Sequence[int], env: EnvBase, *, memory: int) -> BehaviorGoals:
-    """Makes a transform for evaluation that gives episodes the goals in its memory, set by the caller."""
+    """Makes a transform for evaluation: episodes get goals that the caller has put into its memory."""
     return _goals(seeds, env, remember=False, real_share=0.0, candidates=1, memory=memory)
 
 
@@ -78,7 +78,7 @@ def make_uniform(_options: Proposed, goals: MakeGoals, **_: Any) -> BehaviorGoal
 
 
 def make_ibs(options: IBS, goals: MakeGoals, *, runs: int, space: Any, **_: Any) -> BehaviorGoals:
-    """Makes a transform that proposes goals in proportion to q* - q, where q counts proposed goals."""
+    """Makes a transform that proposes goals in proportion to q* (share in the task) - q (share so far)."""
     weights = [make_instructive(options, space=space) for _ in range(runs)]
     return goals(weights=weights, update_on="proposed", candidates=options.candidates)
 

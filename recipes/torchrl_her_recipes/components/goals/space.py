@@ -109,7 +109,7 @@ def _without_grid(task: str, choice: str, width: int) -> bool:
 
 
 def _kernel(task: str, env: Any, options: SequentialIBS, box: Box | None, goals: Tensor) -> KernelSpace:
-    """Makes the space for kernel densities; its default sigma grows as distances do with more coordinates."""
+    """Makes the space for kernel densities; its default sigma grows with the number of goal coordinates."""
     if options.recent is not None:
         raise ValueError(
             f"recent={options.recent} has no effect on {task}, where q is a kernel density: leave it out"

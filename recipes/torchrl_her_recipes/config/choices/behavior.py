@@ -1,4 +1,4 @@
-"""Options of the sources of training goals, made by functions in :mod:`..components.goals.behavior`."""
+"""Options of the sources of training goals; functions in ``components.goals.behavior`` make the sources."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Proposed(Behavior):
     - ``learner``: options of the learner;
     - ``runs``: number of runs;
     - ``rewards``: rewards of a missed and of an achieved goal;
-    - ``space``: space of the task's goals; None unless the options are a subclass of ``Equal`` weights;
+    - ``space``: space of the task's goals; only for options that derive from ``Equal`` weights, else None;
     - ``values``: function that makes the :class:`~torchrl_her.behavior.GoalValues` of the agent.
     """
 
@@ -65,7 +65,7 @@ class _OneOfSome(Proposed):
 @BEHAVIOR.register
 @dataclass(frozen=True, kw_only=True)
 class IBS(IBSWeights, _OneOfSome):
-    """Instructive goals: weights q* - q."""
+    """Goals that the task often has (q*) and episodes seldom get (q): weights q* - q."""
 
     name = "ibs"
     maker = f"{_MAKERS}:make_ibs"

@@ -11,7 +11,7 @@ from torchrl_her_recipes.config.options import REGISTERED, nearest
 
 @dataclass(frozen=True, kw_only=True)
 class Choice(Group):
-    """Base class of the alternatives for a section. Fields are options; the docstring's first line is shown.
+    """Base class of a section's alternatives. Fields are options; help shows the docstring's first line.
 
     Attributes:
         name: Name by which recipes refer to the choice.

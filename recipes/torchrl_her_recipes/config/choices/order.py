@@ -1,4 +1,4 @@
-"""Options of the orders in which stages are learned, made by functions in :mod:`..components.curricula`."""
+"""Options of the orders in which stages are learned; functions in ``components.curricula`` make orders."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class AllAtOnce(_ByEpisode):
 @ORDER.register
 @dataclass(frozen=True, kw_only=True)
 class Teacher(_ByEpisode):
-    """Draws episodes' stages, preferably ones whose success changes (Matiisen et al., 2017)."""
+    """Draws each episode's stage; more often a stage whose success changes (Matiisen et al., 2017)."""
 
     name = "teacher_student"
     maker = f"{_MAKERS}:make_teacher"

@@ -1,4 +1,4 @@
-"""Options of the weights of virtual goals, made by functions in :mod:`..components.goals.weights`."""
+"""Options of the weights of virtual goals; functions in ``components.goals.weights`` make the weights."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class Weights(Choice):
 
     The maker is called once for each run, and returns new :class:`~torchrl_her.GoalWeights`. It takes the
     options and the keyword arguments ``env``, ``seed`` (the run's seed) and ``space`` (the space of the
-    task's goals; None unless the options are a subclass of :class:`Equal`).
+    task's goals; only for options that derive from :class:`Equal`, else None).
     """
 
 
@@ -39,7 +39,7 @@ class Equal(Weights):
 
 @dataclass(frozen=True, kw_only=True)
 class SequentialIBS(Equal):
-    """Weights q* alone; prioritized replay does the rest."""
+    """Goals that the task often has: weights q* instead of q* - q; for prioritized replay."""
 
     name = "ibs_sequential"
     maker = f"{_MAKERS}:make_instructive"
@@ -60,7 +60,7 @@ class SequentialIBS(Equal):
 
 @dataclass(frozen=True, kw_only=True)
 class IBS(SequentialIBS):
-    """Instructive goals: weights q* - q."""
+    """Goals that the task often has (q*) and transitions seldom have (q): weights q* - q."""
 
     name = "ibs"
     needs = (("estimator", "kernel".__ne__, "floor_is_relative cells recent"),)

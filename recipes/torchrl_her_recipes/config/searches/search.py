@@ -62,8 +62,8 @@ class Search:
         for name in numbers:
             if self.sampler == "cmaes" and values.get(name, AUTO) != AUTO and name not in inside:
                 raise ValueError(
-                    f"--sampler cmaes needs a space with the recipe's own values, and {name}={values[name]} "
-                    "lies outside; widen its range, or choose --sampler tpe"
+                    f"--sampler cmaes needs a space that contains the recipe's values, but {name}="
+                    f"{values[name]} lies outside; widen its range, or choose --sampler tpe"
                 )
 
     def to_plain(self) -> dict[str, Any]:

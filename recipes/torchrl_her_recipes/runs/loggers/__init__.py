@@ -1,1 +1,1 @@
-"""Opens TorchRL's loggers for ``log=NAME``, in a way that resumed runs continue them, and logs runs."""
+"""Opens TorchRL's loggers for ``log=NAME``, which a resumed run continues, and logs runs to them."""

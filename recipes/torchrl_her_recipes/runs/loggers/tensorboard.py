@@ -51,7 +51,7 @@ def open_tensorboard(run: RunView, frames: int) -> tuple[TensorboardEvents, int]
 
 
 def _wait_for_the_next_second(files: list[Path]) -> None:
-    """Waits until a new file sorts after ``files``: names, which give the order, have the time in seconds."""
+    """Waits until a new file's name, which has the time in seconds, sorts after the names of ``files``."""
     newest = max(int(path.name.split(".")[3]) for path in files)
     while newest >= int(time.time()) > newest - _PATIENCE:
         time.sleep(0.05)

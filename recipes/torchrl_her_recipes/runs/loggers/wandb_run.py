@@ -19,7 +19,7 @@ _PROJECT = "torchrl-her"
 
 
 class WandbRun(WandbLogger):
-    """Logger whose steps are frames; TorchRL's own counts steps for each group of metrics separately."""
+    """Logger whose steps are frames; TorchRL's logger counts steps for each group of metrics."""
 
     def log_metrics(
         self, metrics: Mapping[str, Any], step: int | None = None, **_options: Any

@@ -237,7 +237,7 @@ def test_nothing_starts_before_it_is_needed() -> None:
     assert components.env.batch_size == torch.Size([1])
     assert components.collector._workers is None
     components.close()
-    with pytest.raises(NotImplementedError, match="seeds of processes that collect are those of the recipe"):
+    with pytest.raises(NotImplementedError, match="processes take their seeds from the recipe"):
         components.collector.set_seed(3)
 
 

@@ -179,7 +179,7 @@ def test_samplers_and_spaces_that_do_not_go_together() -> None:
         ranges={name: {"kind": "float", "low": 0.1, "high": 0.2} for name in ("tau", "action_noise")},
     )
     with pytest.raises(
-        ValueError, match="cmaes needs a space with the recipe's own values, and tau=0.05 lies"
+        ValueError, match="cmaes needs a space that contains the recipe's values, but tau=0.05 lies"
     ):
         Search(recipe=recipe, space=steps, sampler="cmaes")
     with pytest.raises(ValueError, match="sampler must be one of tpe, random, cmaes, got 'grid'"):
