@@ -1,4 +1,4 @@
-"""Throwing and reaching tasks with goals, toy environments and gymnasium's, batched, for TorchRL.
+"""Batched TorchRL environments with goals: throwing and reaching tasks, toys, and wrapped gymnasium tasks.
 
 Names are loaded when they are first used, so that listing the tasks does not take the seconds of importing
 torch. All names are listed in ``__init__.pyi``.
@@ -10,4 +10,4 @@ from torchrl_her_envs.gym.registration import register_gym_ids as _register_gym_
 
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
-_register_gym_ids()  # from here on, gymnasium.make accepts their ids
+_register_gym_ids()  # gymnasium.make then accepts the ids of this package's tasks

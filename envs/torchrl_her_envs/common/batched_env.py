@@ -21,13 +21,13 @@ _COUNTERS = ("step", "episode")  # entries of the state that are counters and no
 
 
 class BatchedEnv(GoalEnv):
-    """Base class of N environments, whose state is tensors of N rows; each environment has a random key.
+    """Base class of N environments whose state is a set of tensors, with one row for each environment.
 
     Subclasses define how episodes start (:meth:`_start_episodes`), what an action does (:meth:`_advance`),
     what the agent observes (:meth:`_show`) and when a goal is achieved (:meth:`compute_terminated`). All
-    random numbers come from the keys (see ``common.seeding``), so environment k with a given seed does the
-    same in every batch. The reward is 0 where the goal is achieved and -1 elsewhere; an achieved goal ends
-    the episode.
+    random numbers derive from a key for each environment (see ``common.seeding``), so environment k with a
+    given seed does the same in every batch. The reward is 0 where the goal is achieved and -1 elsewhere; an
+    achieved goal ends the episode.
 
     Subclasses set ``max_steps`` and ``worlds``, then call :meth:`_make_specs` and
     :meth:`set_seeds`.
@@ -123,7 +123,7 @@ class BatchedEnv(GoalEnv):
         Args:
             states: M rows of each entry of ``worlds``, as :meth:`world_state_dict` gives them; ``step``,
                 ``episode`` and ``key`` are not read.
-            which: [M] of int64, the environments, each of them once.
+            which: [M] of int64, indices of these environments, without repetitions.
 
         Returns:
             The current ``state``, ``observation`` and goals of all N environments.
@@ -171,7 +171,7 @@ class BatchedEnv(GoalEnv):
             actual = state[name].shape
             if actual[:1] != shape[:1]:
                 count = actual[0] if actual else 0
-                raise ValueError(f"the state must be of {shape[0]} environments, got {name!r} of {count}")
+                raise ValueError(f"the state must have {shape[0]} rows, got {name!r} with {count}")
             if actual != shape:
                 raise ValueError(f"{name!r} of the state must be of shape {list(shape)}, got {list(actual)}")
 

@@ -57,8 +57,8 @@ class GoalEnds:
 
     Args:
         name: name of the environment, for messages.
-        env_ends: whether goals end an episode by the environment's ``compute_terminated``; None if it has no
-            such function.
+        env_ends: whether the environment's ``compute_terminated`` is true at goals, which ends episodes; None
+            if the environment has no such function.
         tells_success: whether the infos of steps have ``is_success``.
 
     Attributes:
@@ -227,11 +227,11 @@ def check_rewards(
     if not len(missed):
         least, most = min(others) + 0.0, max(others) + 0.0
         raise ValueError(
-            f"{name}: equal goals give {equal:g}, and other pairs from {least:g} to {most:g}; equal goals "
-            "must give the most, and compute_reward must depend on its two goals alone"
+            f"{name}: equal goals have the reward {equal:g}, other pairs {least:g} to {most:g}; equal goals "
+            "must have the highest reward, and compute_reward must depend on its two goals alone"
             if most > equal or equal < 0
-            else f"{name}: other goals give {equal:g}, as equal goals do; they must give less (are all goals "
-            "achieved from the start?)"
+            else f"{name}: different goals have the reward {equal:g}, like equal goals; it must be lower "
+            "(are all goals achieved from the start?)"
         )
     dense = is_dense(equal, others)
     if given is None:
@@ -239,10 +239,10 @@ def check_rewards(
             some = missed[np.linspace(0, len(missed) - 1, _SHOWN).astype(int)]
             example = f"{equal - 0.05 * (equal - missed[0]):.2g}"
             raise ValueError(
-                f"{name} has a dense reward: goals that are not achieved give "
-                f"{', '.join(f'{value:g}' for value in some)} and more, equal ones {equal:g}. Say from "
-                f"which reward on a goal counts as achieved, as in task.options.achieved_reward={example}, "
-                "or choose a sparse reward"
+                f"{name} has a dense reward: "
+                f"{', '.join(f'{value:g}' for value in some)} and other values for missed goals, {equal:g} "
+                "for equal goals. Give the least reward at which a goal counts as achieved, as in "
+                f"task.options.achieved_reward={example}, or choose a sparse reward"
             )
         return float(missed[0]), equal, False
     if isinstance(given, bool) or not isinstance(given, int | float) or not missed[0] < given <= equal:
@@ -276,8 +276,8 @@ def equal_with_info(name: str, equal: np.ndarray, others: np.ndarray, given: flo
     most = float(equal.max())
     if given is None and most <= others.min():
         raise ValueError(
-            f"{name}: equal goals give {most:g} with the infos of {len(equal)} random steps, as others do; "
-            "say from which reward on a goal counts as achieved, as in task.options.achieved_reward=0"
+            f"{name}: with the infos of {len(equal)} random steps, equal goals have the reward {most:g}, "
+            "like other goals; give the least reward for achieving one: task.options.achieved_reward=..."
         )
     return most if given is None else max(most, given)
 

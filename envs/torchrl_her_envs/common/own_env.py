@@ -40,7 +40,7 @@ from torchrl_her_envs.common.seeding import as_seeds, block_keys
 KEYS = ("observation", "achieved_goal", "desired_goal")
 _GOALS = KEYS[1:]
 _SUCCESS = "is_success"
-# Options of make_own_env itself, which each environment takes.
+# Options of make_own_env that apply to every environment, besides the options of the user's function.
 _OURS = ("max_steps", "termination", "achieved_reward", "info_keys", *(f"{key}_key" for key in KEYS))
 _TRIED_STEPS = 100
 _PAIRED = 8  # number of achieved and of desired goals whose pairs are passed to the reward to try it
@@ -64,10 +64,10 @@ def make_own_env(
 
     Args:
         path: ``"module:name"`` of a function or class that makes a TorchRL ``EnvBase``; the module is
-            imported. ``seed`` and ``max_steps`` are passed if it takes them. If it takes ``num_envs``, it
-            must make environments of batch size ``[num_envs]``; with R seeds it is called once if these have
-            ``set_seeds``, otherwise R times. If not, it is called ``num_envs`` times and must make
-            environments without a batch size, which are stepped one after the other.
+            imported. ``seed`` and ``max_steps`` are passed if the function takes them. A function that takes
+            ``num_envs`` must make a batch [num_envs] of environments; it is called once for R seeds if the
+            batch has ``set_seeds``, and otherwise R times. A function without ``num_envs`` is called
+            ``num_envs`` times, and makes single environments, which are stepped one after the other.
         num_envs: number of environments.
         seed: seed of all environments; R seeds for R equal blocks of them.
         max_steps: length of an episode; the environment's attribute ``max_steps`` if None.
@@ -216,12 +216,12 @@ class OwnGoalEnv(GoalEnv):
     [..., g] to rewards [..., 1]. Optional:
 
     - ``compute_terminated(achieved_goal, desired_goal)``, which maps goals [..., g] to bool [..., 1]. If it
-      is missing, ``termination`` says what ends an episode at its goal, as for
-      :class:`~torchrl_her_envs.GymGoalEnv`; an entry ``is_success`` of a step replaces the one of ``info``.
-    - Further entries that rewards depend on, if ``info_keys`` names them. Both functions then get a third
-      argument, a dictionary of these entries [..., w] of the same step; for a virtual goal, too. Transitions
-      have them as ``("info", KEY)``.
-    - ``max_steps``, the length of an episode; the option of that name is needed if it is missing.
+      is missing, ``termination`` chooses what ends an episode at its goal, as for
+      :class:`~torchrl_her_envs.GymGoalEnv`, where ``is_success`` is an entry of steps, not of ``info``.
+    - Further entries of steps that rewards depend on, if ``info_keys`` names them. Both functions then get a
+      third argument, a dictionary of these entries [..., w], for real and virtual goals of the step.
+      Transitions have the entries as ``("info", KEY)``.
+    - ``max_steps``, the length of an episode; without it, the option ``max_steps`` must be given.
     - ``stages()``, see :class:`~torchrl_her_envs.GoalEnv`.
     - ``render()``, a picture [height, width, 3] of uint8, or [N, height, width, 3] of a batch.
     - ``set_seeds(seeds)`` of a batch, for R equal blocks; a batch without it has one seed.
@@ -571,7 +571,7 @@ class OwnGoalEnv(GoalEnv):
         stepped = after["reward"].flatten()
         computed = self.compute_reward(achieved, desired, after).flatten()
         reached = computed >= met
-        went_on = ~after["terminated"].flatten() | reached  # no failures: computed rewards lack their cost
+        went_on = ~after["terminated"].flatten() | reached  # without failures, whose cost is not computed
         warn_once(check_same_rewards(self._name, stepped[went_on].numpy(), computed[went_on].numpy()))
         first, env_ends = self._envs[0], None
         if callable(getattr(first, "compute_terminated", None)):

@@ -53,7 +53,7 @@ def fetch_names(id: str) -> dict[str, list[int]]:
 def fetch_stages(id: str) -> list[dict[str, Any]]:
     """Returns the stages of a Fetch task: reach the object, then move it; [] for other environments.
 
-    The goal of the first stage, the object's position, is what the second stage observes at the same inputs.
+    The object's position, the first stage's goal, is observed in the second stage at the same network inputs.
     Tasks of reaching a point have one stage. A block to be picked up must first be between the fingers.
 
     Args:

@@ -163,25 +163,25 @@ class GymGoalEnv(GoalEnv, GymWrapper):
     Observations and goals that are dictionaries become vectors, in the order of
     ``torchrl_her_envs.gym.layout.Layout``; the environment's own functions get goals in their original form.
 
-    The environment's ``compute_terminated`` decides whether a goal ends an episode. If it has none,
-    ``termination`` decides:
+    The environment's ``compute_terminated`` decides whether a goal ends an episode. Without this function,
+    ``termination`` chooses the steps that terminate an episode at its goal:
 
-    - ``"success"``: a step whose ``info["is_success"]`` is true, and virtual goals whose reward is that of
-      an achieved goal, since they have no ``info``.
-    - ``"reward"``: a real or virtual goal whose reward is that of an achieved goal.
-    - ``"never"``: no goal. An episode that the environment ends at its goal is ``truncated``.
+    - ``"success"``: steps whose ``info["is_success"]`` is true. For virtual goals, which have no ``info``,
+      steps with the reward of an achieved goal.
+    - ``"reward"``: steps with the reward of an achieved goal, for real and virtual goals.
+    - ``"never"``: no steps. An episode that the environment ends at its goal is ``truncated``.
     - ``"auto"``: chosen after 100 steps of random actions. ``"success"`` (or ``"reward"`` without
       ``is_success``) if the environment ended an episode at an achieved goal; ``"never"`` if it continued
       there, or if no goal was achieved. The choice is logged.
     - ``"watch"``: the environment ends episodes as it does by itself, and ``goal_ends`` counts the episodes
       that it ended or continued at their goals.
 
-    The first three replace ``compute_terminated``; ``"own"`` keeps it. Where the environment ends an episode
-    for another reason, as by a fall, it is ``terminated`` whatever the rule.
+    The first three, if given, replace ``compute_terminated``; ``"own"`` keeps it. If the environment ends an
+    episode for another reason, as by a fall, the episode is ``terminated`` by every rule.
 
     If the environment's functions read more than the goals, ``info_keys`` names the entries of ``info``. They
-    become entries of transitions, ``("info", KEY)``, so that virtual ones are rewarded with the info of
-    their own step: ``EnvReward(env.compute_reward, env.compute_terminated, info_keys=env.info_keys)``.
+    become entries of transitions, ``("info", KEY)``, from which rewards of virtual goals are computed:
+    ``EnvReward(env.compute_reward, env.compute_terminated, info_keys=env.info_keys)``.
 
     :func:`make_gym_env` makes such environments.
 
@@ -261,7 +261,7 @@ class GymGoalEnv(GoalEnv, GymWrapper):
         )
         computed = self._reward_of(trial.achieved, trial.desired, stepped)
         met = computed >= self.achieved_reward
-        went_on = ~trial.terminated | met  # no failures: computed rewards lack their cost
+        went_on = ~trial.terminated | met  # without failures, whose cost is not computed
         warn_once(
             self._reward_of.hint(info) or check_same_rewards(id, trial.reward[went_on], computed[went_on])
         )
@@ -295,7 +295,7 @@ class GymGoalEnv(GoalEnv, GymWrapper):
     def _function(
         self, name: str, goals: tuple[np.ndarray, np.ndarray], info: dict[str, np.ndarray]
     ) -> GoalFunction:
-        """Wraps a function of the environment for goals [B, g], which it gets in their original form."""
+        """Wraps a function of the environment, which takes goals in their original form, for goals [B, g]."""
         method, layout = self._reference_env.get_wrapper_attr(name), self._layouts["achieved_goal"]
 
         def function(achieved: np.ndarray, desired: np.ndarray, info: Any) -> Any:
@@ -473,7 +473,7 @@ class GymGoalEnv(GoalEnv, GymWrapper):
         which = np.ones(self.batch_size, np.bool_) if mask is None else mask.view(-1).numpy()
         options = {"options": {"reset_mask": which}} if not which.all() else {}
         # Each reset gets a seed, since some environments (panda-gym's) otherwise draw one from the system.
-        # It has 31 bits, since others pass it to generators that take 32.
+        # The seed has 31 bits, since some environments pass it to generators that take at most 32.
         seeds = (uniform(self._seed_keys, self._episodes, 1)[:, 0] * 2**31).astype(np.int64)
         observations, info = self._env.reset(seed=seeds.tolist(), **options)
         self._episodes += which

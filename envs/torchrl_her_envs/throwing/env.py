@@ -44,8 +44,8 @@ class ThrowingEnv(BatchedEnv):
     Positions are observed as ``2 * screen - 1``. The environments are independent: environment k with a given
     seed does the same in every batch, and a partial reset leaves the others as they are.
 
-    pymunk computes contacts and bounces only. Free flight is summed in Chipmunk's order, with equal results;
-    hand, arm, catching, goals and rewards are array code.
+    pymunk computes contacts and bounces only. Array code computes free flight, with the same results as
+    Chipmunk (pymunk's engine), and hand, arm, catching, goals and rewards.
 
     Args:
         task: the task, one of :data:`~torchrl_her_envs.TASKS`.

@@ -1,9 +1,9 @@
-"""Free balls in many worlds at once: flight as sums of arrays, contacts in one Chipmunk space.
+"""Free balls in many worlds at once: flight by array code, contacts by one Chipmunk space (pymunk).
 
 pymunk simulates the balls that may touch something within a step: 3 to 12 % of the steps with random
-actions on the throwing tasks, none on `robot_v1`. Free flight is summed in Chipmunk's order, and is equal
-to its results to the last bit. Only this file imports pymunk; other files decide which balls are held, caught
-or thrown.
+actions on the throwing tasks, none on `robot_v1`. Array code adds up free flight in Chipmunk's order, so
+results are equal to the last bit. Only this file imports pymunk; other files decide which balls are held,
+caught or thrown.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ class BallPhysics:
     A bounce keeps ``world.bounce`` of the normal speed; along the surface friction slows the ball,
     which slides and never rolls (its moment of inertia is infinite).
 
-    The balls of all worlds are at the same place in one space, and do not collide with each other. So a
-    ball's path depends on nothing but its own position and velocity, to the last bit, whichever worlds are
-    beside it. Balls that touch nothing within a step need no space: a few sums give the same result as
+    All worlds share one Chipmunk space and its coordinates, and their balls do not collide. So a ball's path
+    depends on nothing but the ball's position and velocity, to the last bit, whichever other worlds there
+    are. Balls that touch nothing within a step need no space: a few sums give the same result as
     Chipmunk.
 
     Args:
@@ -178,7 +178,7 @@ class _Limits:
 
 
 class _Space:
-    """Chipmunk space with the sides and the wall of one world, and one ball for each that moves in a step.
+    """Chipmunk space with sides and wall, shared by all worlds whose balls may touch something in a step.
 
     Args:
         world: the constants of the world.

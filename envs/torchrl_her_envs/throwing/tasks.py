@@ -30,7 +30,7 @@ _WHOLE = ("substeps", "max_steps")
 class WorldConfig:
     """The constants of the world, in SI units unless a comment says otherwise.
 
-    "screen" is a fraction of the side of the square screen, with (0, 0) at the bottom left.
+    Values with the comment "screen" are fractions of the square screen's side, from the bottom left.
     The agent observes positions as ``2 * screen - 1``, so from -1 to 1, and speeds as a fraction of
     ``hand_speed`` (or ``joint_speed``).
 
@@ -189,7 +189,7 @@ TASKS: dict[str, Task] = {
             effector="hand",
             start="held",
             wall=True,
-            goal_sigma=0.1,  # behind the wall, fewer of the goals around a goal can be reached
+            goal_sigma=0.1,  # smaller, since fewer goals near a goal behind the wall can be reached
             summary="throw a held ball over a wall",
         ),
         Task(

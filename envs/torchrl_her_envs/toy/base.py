@@ -37,8 +37,8 @@ class ToyState:
 class ToyEnv(BatchedEnv):
     """N environments whose states are places on a lattice, and whose goals are such places too.
 
-    Keys: ``observation`` (the place), ``achieved_goal`` (the place too; the last part of it in a
-    :class:`Chain` of stages), ``desired_goal``, ``state`` (the observation followed by the desired
+    Keys: ``observation`` (the place), ``achieved_goal`` (the place, too, or its last part in
+    a :class:`Chain` of stages), ``desired_goal``, ``state`` (the observation followed by the desired
     goal), ``action`` (a whole number), ``reward`` (0 where the goal is achieved, -1 elsewhere),
     ``terminated`` (the goal is achieved), ``truncated`` (the last step, or an end that says nothing
     about the goal), ``done``.
@@ -47,9 +47,9 @@ class ToyEnv(BatchedEnv):
     ``QValueActor`` then takes the first one, while a one-hot action would have a 1 for each. A replay buffer
     also stores just one number a row. ``DQNLoss`` and ``EGreedyModule`` take either form.
 
-    No episode starts at its goal, since it would end without an action. The environments are independent:
-    environment k with a given seed does the same in every batch, and a partial reset leaves the others as
-    they are.
+    No episode starts at its goal, since such an episode would end without an action. The environments are
+    independent: environment k with a given seed does the same in every batch, and a partial reset leaves the
+    others as they are.
 
     Args:
         goals: distribution of the desired goals.

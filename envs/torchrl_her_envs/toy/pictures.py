@@ -109,7 +109,7 @@ def draw_treasure(sheet: Sheet, pirate: float, treasure: float) -> None:
 def draw_chain(sheet: Sheet, closed: int, length: int) -> None:
     """Draws the links of a chain, closed ones filled; the last one, the goal, has a green edge.
 
-    For a very long chain, draws the closed share of its length.
+    A very long chain is drawn as a bar, filled up to the share of closed links.
     """
     if length > _MOST_CELLS:
         sheet.box((0.05, 0.25, 0.95, 0.35), _LIGHT, outline=INK, line=0.006)

@@ -419,7 +419,7 @@ def test_robots_repeat_and_do_the_same_in_every_batch() -> None:
 def test_goals_that_are_all_met_from_the_start_tell_nothing() -> None:
     """The reward of a goal that is far away is not known then."""
     with pytest.raises(
-        ValueError, match=r"HandReach-v0: other goals give 0, as equal goals do; they must .*"
+        ValueError, match=r"HandReach-v0: different goals have the reward 0, like equal goals; it must .*"
     ):
         make_gym_env("torchrl_her_envs:torchrl_her/HandReach-v0", threshold=10.0)
 
@@ -450,12 +450,12 @@ def sparse(met: Any) -> Any:
     ("judge", "message"),
     [
         (lambda own, a, d, _: sparse(own.place == d).max(-1), "some steps later, for the same two goals; it"),
-        (lambda own, a, d, _: sparse(a > d).max(-1), "equal goals give -1, and other pairs from -1 to 0"),
+        (lambda own, a, d, _: sparse(a > d).max(-1), "equal goals have the reward -1, other pairs -1 to 0"),
         (
             lambda own, a, d, _: sparse(a * 0 > d).max(-1),
-            "equal goals give -1, and other pairs from -1 to -1",
+            "equal goals have the reward -1, other pairs -1 to -1",
         ),
-        (lambda own, a, d, _: sparse(a < d + 9).max(-1), "other goals give 0, as equal goals do"),
+        (lambda own, a, d, _: sparse(a < d + 9).max(-1), "different goals have the reward 0, like equal"),
     ],
 )
 def test_rewards_that_do_not_tell_goals_apart_are_refused(judge: Any, message: str) -> None:

@@ -193,10 +193,10 @@ def test_a_state_of_another_number_of_environments_is_refused(count: int) -> Non
     for each in (env, other):
         each.reset()
     before = env.world_state_dict()
-    with pytest.raises(ValueError, match=f"the state must be of 4 environments, got 'joints' of {count}"):
+    with pytest.raises(ValueError, match=f"the state must have 4 rows, got 'joints' with {count}"):
         env.load_world_state_dict(other.world_state_dict())
     key = other.world_state_dict()["key"]
-    with pytest.raises(ValueError, match=f"the state must be of 4 environments, got 'key' of {count}"):
+    with pytest.raises(ValueError, match=f"the state must have 4 rows, got 'key' with {count}"):
         env.load_world_state_dict(before | {"goal": before["goal"] + 1.0, "key": key})
     assert all(equal(env.world_state_dict(), before).values())
 

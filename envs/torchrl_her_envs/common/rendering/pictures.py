@@ -73,7 +73,7 @@ def captioned(picture: Tensor, words: str) -> Tensor:
     draw = ImageDraw.Draw(image)
     height = max(6.0, _TEXT * image.height)
     font, place = ImageFont.load_default(size=height), (0.98 * image.width, 0.02 * image.height)
-    # A strip below the text, since the picture may have any color there.
+    # A strip behind the text, which keeps it readable on a picture of any color.
     draw.rectangle(draw.textbbox(place, words, font=font, anchor="ra"), fill=MARGIN)
     draw.text(place, words, fill=INK, font=font, anchor="ra")
     return torch.from_numpy(np.array(image))

@@ -16,7 +16,7 @@ try:
     import imageio.v2 as imageio_v2
 
     imageio: Any = imageio_v2
-except ImportError:  # only MP4 needs it
+except ImportError:  # only MP4 files need imageio
     imageio = None
 
 _COLORS = 255  # number of colors of a GIF; the last of 256 is transparent, for unchanged pixels
@@ -73,7 +73,7 @@ def _write_gif(frames: Sequence[Tensor], path: Path, fps: float) -> None:
     palette = _shared_palette(frames)
     # Dithering would make still areas flicker, and the file large.
     images = [_image(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
-    duration = max(20, 10 * round(100 / fps))  # milliseconds; many viewers slow down what is faster than 20
+    duration = max(20, 10 * round(100 / fps))  # milliseconds; many viewers slow down frames below 20
     images[0].save(path, save_all=True, append_images=images[1:], duration=duration, loop=0, optimize=True)
 
 

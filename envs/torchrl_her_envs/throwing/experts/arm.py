@@ -83,7 +83,7 @@ def _swings(joints: Tensor, arm: Effector, world: WorldConfig) -> tuple[Tensor, 
 
 
 def _steps_to_column(gap: Tensor, speed: Tensor, world: WorldConfig) -> Tensor:
-    """Returns the whole steps [..., 2] before and after a ball crosses a horizontal gap in meters."""
+    """Returns the numbers of steps [..., 2], rounded down and up, in which a ball crosses a gap in x."""
     steps = (
         gap / (speed.clamp(min=1e-3) * world.time_step)
     ).floor()  # a ball that moves left never crosses the gap

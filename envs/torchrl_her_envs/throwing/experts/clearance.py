@@ -28,7 +28,7 @@ def clears_ceiling(start: Tensor, velocity: Tensor, world: WorldConfig) -> Tenso
 
 
 def clears_wall(start: Tensor, velocity: Tensor, world: WorldConfig) -> Tensor:
-    """Returns a mask [...] of the flights that pass above the wall, all of which go right from left of it.
+    """Returns a mask [...] of the flights, from left of the wall to the right, that pass above the wall.
 
     A parabola that is above both upper corners is above all between them.
 

@@ -62,7 +62,7 @@ class Controller(TensorDictModuleBase):
         task: the task, see :data:`~torchrl_her_envs.TASKS`.
         world: the constants of the world.
         threshold: distance below which a goal is achieved, in observed coordinates; the task's if None. With
-            a far smaller one the arm may find no throw, since it tries a grid of throws.
+            a far smaller threshold the arm may find no throw, since it tries a grid of throws.
         num_links: number of links of the arm, for the robot's tasks.
 
     Raises:
@@ -118,7 +118,7 @@ class Controller(TensorDictModuleBase):
             return _Seen(joints, goal, torch.zeros_like(goal), goal, torch.zeros(len(goal), dtype=torch.bool))
         ball, velocity = self._meters(state[:, -6:-4]), state[:, -4:-2] * self.world.hand_speed
         closed = state[:, -7] > 0.5
-        # A closed hand holds the ball wherever it could catch it: the dynamics leave no other case.
+        # A closed hand that is near enough to catch the ball holds it already, by the dynamics.
         return _Seen(joints, ball, velocity, goal, closed & self._can_catch(joints, ball))
 
     def _flies_home(self, seen: _Seen) -> Tensor:

@@ -76,7 +76,7 @@ def _aims(goal: Tensor, world: WorldConfig, *, within: float) -> Tensor:
 
 
 def _steps_to(gap: Tensor, stride: float) -> Tensor:
-    """Returns the steps of a hand for a way [..., 2], with at most ``stride`` a step in each direction."""
+    """Returns the number of steps of a hand over a gap [..., 2], at most ``stride`` a step in x and in y."""
     return (gap.abs().amax(-1) / stride - 1e-3).ceil()  # a thousandth of a stride may be rounding
 
 

@@ -36,7 +36,7 @@ def two_link_angles(point: Tensor, base: Tensor, length: float) -> Tensor:
                 [0.6000, 0.8000]])
     """
     gap = point - base.to(point)
-    # In a triangle of two equal links the elbow's angle halves on both sides of the line to the point.
+    # Links and the line to the point form a triangle with two equal angles, each half of the elbow's turn.
     half = (gap.norm(dim=-1) / length).clamp(max=1.0).acos()
     half = torch.stack((half, -half), -1)
     heading = torch.atan2(gap[..., 1], gap[..., 0]).unsqueeze(-1)
@@ -44,7 +44,7 @@ def two_link_angles(point: Tensor, base: Tensor, length: float) -> Tensor:
 
 
 def nearest_turn(joints: Tensor, point: Tensor, base: Tensor, length: float) -> Tensor:
-    """Returns the turn [..., 2] of the joints to the solution that the slower joint reaches sooner.
+    """Returns the turn [..., 2] of the joints to a point: the solution whose largest turn is smaller.
 
     Args:
         joints: [..., 2], the present angles.

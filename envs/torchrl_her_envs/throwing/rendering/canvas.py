@@ -136,7 +136,7 @@ class Canvas:
         self._image.paste(sprite, corner, sprite)
 
     def text(self, place: Point, words: str, *, height: float, fill: Color) -> None:
-        """Draws a line of text with its top right corner at a place."""
+        """Draws a line of text with its top right corner at a point."""
         font = ImageFont.load_default(size=height * self._scale)
         self._draw.text(self._at(place), words, fill=fill, font=font, anchor="ra")
 
