@@ -27,7 +27,7 @@ def _complete(_context: click.Context, _parameter: click.Parameter, incomplete: 
 @click.option("--quick", is_flag=True, help="shrink the study so that it takes minutes")
 @click.option("--folder", type=_FOLDER, help="output folder (default: runs/NAME)")
 @click.option(
-    "--plan", is_flag=True, help="only print the runs to do, with their time if some epochs are done"
+    "--plan", is_flag=True, help="only print unfinished runs, with the remaining time if it can be estimated"
 )
 @click.option("--jobs", type=click.IntRange(1), help="batches of seeds at once (default: one for each core)")
 @click.option("--ray", metavar="ADDRESS", help="train on a Ray cluster at this address: auto, or HOST:PORT")

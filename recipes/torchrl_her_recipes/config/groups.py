@@ -48,7 +48,7 @@ class TaskConfig(Group):
     failure: str = option(
         "never_pays",
         "reward if an episode fails, as by a fall: never_pays (the return of never achieving the goal), "
-        "environment (the environment's reward) or truncate (the same, but the episode is truncated)",
+        "environment (the environment's reward) or truncate (the same, and the episode is truncated)",
         choices=("never_pays", "environment", "truncate"),
     )
 
@@ -185,7 +185,7 @@ class HindsightConfig(Group):
     )
     refill: int = option(
         5,
-        "if the filter leaves transitions without goals, others get more, up to this multiple of k",
+        "if the filter rejects all goals of a transition, others get more goals, up to this many times k",
         at_least=1,
     )
     redraw: bool = option(
@@ -238,13 +238,13 @@ class CurriculumConfig(Group):
     )
     guided_per: str = option(
         "episode",
-        "whether guided_share is of episodes, or of steps in which the previous stage's goal is not achieved",
+        "what guided_share is a share of: episodes, or steps before the previous stage's goal is achieved",
         choices=("episode", "step"),
     )
     alpha_actor: float = option(
         0.0, "scale of the actor's initial weights for inputs that the first stage does not use", at_least=0
     )
-    alpha_critic: float = option(0.0, "the same scale as alpha_actor, for the critics", at_least=0)
+    alpha_critic: float = option(0.0, "like alpha_actor, for the initial weights of critics", at_least=0)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -292,14 +292,14 @@ class DemonstrationsConfig(Group):
         at_least=0,
         at_most=1,
     )
-    starts_width: int = option(4, "number of successive states from which such a start is drawn", at_least=1)
+    starts_width: int = option(4, "number of successive states from which a start is drawn", at_least=1)
     starts_stride: int = option(
-        2, "steps by which starts move toward the beginning when their episodes succeed", at_least=1
+        2, "steps by which starts move toward the demonstration's beginning if episodes succeed", at_least=1
     )
     starts_threshold: float = option(
-        0.5, "mean success of episodes with such starts at which starts move", above=0, at_most=1
+        0.5, "mean success of episodes with demonstrated starts at which starts move", above=0, at_most=1
     )
-    starts_samples: int = option(50, "episodes whose mean is compared with starts_threshold", at_least=1)
+    starts_samples: int = option(50, "number of episodes averaged for starts_threshold", at_least=1)
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -71,7 +71,7 @@ class Teacher(_ByEpisode):
     maker = f"{_MAKERS}:make_teacher"
 
     progress_memory: float = option(
-        200.0, "later episodes of a stage after which an episode's weight has fallen to 1 / e", above=0
+        200.0, "number of later episodes of a stage that lower an episode's weight to 1 / e", above=0
     )
     even_share: float = option(
         0.2, "share of the episodes whose stage is drawn with equal probabilities", above=0, at_most=1
