@@ -75,9 +75,9 @@ def pieces(cluster: Cluster, nodes: Sequence[Node], components: Components) -> t
     weights = TensorDict.from_module(components.policy).data
     unwritten = trainer.frames - buffer.writer.totals.real
     sent = (
-        f"After new episodes everywhere, {unwritten:,} frames are not written: those of episodes that are "
-        f"open now. A frame is {size(batch) / batch.numel():,.0f} bytes, the weights of the policy are "
-        f"{size(weights) / 1e6:.2f} MB."
+        f"When all episodes have begun anew, {unwritten:,} frames are not written: those of the episodes "
+        f"that are open now. A frame is {size(batch) / batch.numel():,.0f} bytes, the weights of the policy "
+        f"are {size(weights) / 1e6:.2f} MB."
     )
     return rows, sent
 
