@@ -83,8 +83,8 @@ def check_generators(runs: int, generators: Sequence[torch.Generator] | None) ->
     check_whole(runs=runs)
     if generators is None:
         if runs > 1:
-            raise ValueError(f"{runs} runs need {runs} generators, one of each run, got None")
+            raise ValueError(f"{runs} runs need {runs} generators, one for each run, got None")
         return None
     if len(generators) != runs:
-        raise ValueError(f"{runs} runs need {runs} generators, one of each run, got {len(generators)}")
+        raise ValueError(f"{runs} runs need {runs} generators, one for each run, got {len(generators)}")
     return list(generators)

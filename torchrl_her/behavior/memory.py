@@ -60,7 +60,7 @@ class AchievedGoals:
         """
         number = len(goals) // self.runs
         if number * self.runs != len(goals):
-            raise ValueError(f"{len(goals)} goals cannot be shared out among {self.runs} runs")
+            raise ValueError(f"the number of goals must be a multiple of runs={self.runs}, got {len(goals)}")
         if number > self.capacity:
             raise ValueError(f"{number} goals of each run do not fit into a memory of {self.capacity}")
         if self._rows is None:
@@ -126,7 +126,7 @@ class AchievedGoals:
         written, capacity = state["written"], state["capacity"]
         if (len(written), capacity) != (self.runs, self.capacity):
             raise ValueError(
-                f"the state must be of {self.runs} runs with {self.capacity} goals each, got one of "
+                f"the state must have {self.runs} runs with {self.capacity} goals each, got "
                 f"{len(written)} runs with {capacity}"
             )
         self._written, self._rows = written.clone(), None

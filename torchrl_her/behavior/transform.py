@@ -182,7 +182,7 @@ class BehaviorGoals(Transform):
         parts = {"weights": self.weights, "factors": self.factors}
         for name, each in parts.items():
             if len(each) != len(state[name]):
-                raise ValueError(f"the state has {len(state[name])} {name}, not {len(each)}")
+                raise ValueError(f"the state must have {len(each)} {name}, got {len(state[name])}")
             for part, was in zip(each, state[name], strict=True):
                 part.load_state_dict(was)
         set_generator_states(self.generators, state["generators"])
@@ -196,7 +196,7 @@ class BehaviorGoals(Transform):
         real = self._get(tensordict_reset, goal_key)
         number = real.shape[:-1].numel()
         if number % self.runs:
-            raise ValueError(f"{number} environments cannot be shared out among {self.runs} runs")
+            raise ValueError(f"a batch must have a multiple of runs={self.runs} environments, got {number}")
         mask = tensordict.get("_reset", None)
         begins = torch.ones_like(real[..., :1], dtype=torch.bool) if mask is None else mask
         begins = begins.view(*real.shape[:-1], 1)
@@ -228,10 +228,10 @@ class BehaviorGoals(Transform):
         before = self._get(next_tensordict, self.keys.reward)
         ended = self._get(next_tensordict, self.keys.terminated)
         fell = ended & (before < self.achieved_reward)
-        if bool(fell.any()):  # a fall ends the episode for any goal; success at the task's own goal does not
+        if bool(fell.any()):  # an end without success, such as a fall, ends it for any goal
             own_reward, own_end = call_reward(self.reward_fn, outcome, real)
             fell = fell & ~own_end
-            reward = reward + (before - own_reward).clamp(max=0.0) * fell  # the fall's penalty
+            reward = reward + (before - own_reward).clamp(max=0.0) * fell  # the cost of the fall
         reached = self._get(tensordict, reached_key) | (proposed & (reward >= self.achieved_reward))
         terminated = torch.where(proposed, terminated | fell, ended)
         done = terminated

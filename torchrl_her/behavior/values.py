@@ -90,7 +90,7 @@ class GoalValues:
         rows = rows if self.before_critic is None else self.before_critic(rows)
         values = critic_values(self.loss, rows)
         if values is None:
-            raise ValueError(f"{type(self.loss).__name__} has no critics whose values are known")
+            raise ValueError(f"{type(self.loss).__name__} has no critics like those of DDPG, SAC or DQN")
         lengths = torch.tensor(counts, device=goals.device).unsqueeze(1)
         is_row = (torch.arange(max(counts), device=goals.device) < lengths).flatten()  # False for padding
         return values.to(goals.device).unflatten(0, (len(blocks), width))[is_row]

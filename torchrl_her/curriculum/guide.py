@@ -1,4 +1,4 @@
-"""Exploration guided by the policy of the stage below, which plays the beginning of some episodes."""
+"""Guided exploration: the policy of the previous stage plays the beginning of some episodes."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ class GuidedExploration(TensorDictModuleBase):
 
     When a stage begins, its buffer has no episode that achieved its goal, and a policy that learns from
     failures alone soon forgets what it could do: a gripper no longer reaches the block that it should push.
-    In a share of the episodes, a copy of the policy that had learned the stage below acts until that stage's
-    goal is achieved, and then the present policy. That is the self-guided exploration of Luo et al., Relay
-    Hindsight Experience Replay, 2022 (arXiv 2208.00843), here with the stages one after another.
+    In a share of the episodes, a copy of the policy that had learned the previous stage acts until the goal
+    of that stage is achieved. Then the present policy acts. This is the self-guided exploration of Luo et
+    al., Relay Hindsight Experience Replay, 2022 (arXiv 2208.00843), here with one stage after another.
 
     With ``per="step"``, as in the paper, whether the copy acts is drawn in each step in which the goal of the
-    stage below is not achieved. So the copy also acts when that goal was achieved and then lost.
+    previous stage is not achieved. So the copy also acts when that goal was achieved and then lost.
 
     If each episode has its own stage (``stage_key``), the present policy itself guides, as in the paper: it
     acts as in the first stage until the goal of that stage is achieved, then as in the next stage, up to the
-    episode's own stage. With ``per="step"`` it acts as in the stage after the last one whose goal is achieved
-    at that moment. So the goal of a stage must include all that the next stage requires.
+    episode's own stage. With ``per="step"`` each step finds the last stage whose goal is achieved, and the
+    policy acts as in the next one. So the goal of a stage must include all that the next stage requires.
 
     Put it after the policy and before noise. The environment must have TorchRL's ``InitTracker``. The
     environments of R runs are R equal blocks of the batch, in the order of the runs. Under
@@ -112,7 +112,7 @@ class GuidedExploration(TensorDictModuleBase):
         self.guided: Tensor | None = None
         # Columns of each stage's inputs, achieved goal and desired goal in ``Curriculum.extend(state)``.
         self._columns = torch.tensor([self._columns_of(stage) for stage in curriculum.stages])
-        # The guide acts up to the stage below the episode's, so the last stage needs no threshold here.
+        # The guide never acts in the last stage, whose threshold may be None and is not used here.
         self._squares = torch.tensor([(stage.threshold or 0.0) ** 2 for stage in curriculum.stages])
 
     @property
@@ -154,13 +154,13 @@ class GuidedExploration(TensorDictModuleBase):
         state, begun = tensordict.get(state_key), tensordict.get(init_key)
         runs = len(self.generators)
         if len(state) % runs:
-            raise ValueError(f"{len(state)} rows cannot be shared out among {runs} runs")
+            raise ValueError(f"the number of rows must be a multiple of runs={runs}, got {len(state)}")
         top = None if by_run else tensordict.get(self.stage_key).view(begun.shape)
         guided = self._begin(torch.ones_like(begun) if self.per == "step" else begun, top)
         if not bool((guided >= 0).any()):
             return tensordict
         acting, after = guided >= 0, guided + 1
-        if self.per == "step" and top is not None:  # goals of lower stages may be missed again
+        if self.per == "step" and top is not None:  # an achieved goal may have been lost again
             after = self._after_the_last_achieved(state, top)
         else:
             acting &= self._achieved(state, guided)
@@ -193,7 +193,7 @@ class GuidedExploration(TensorDictModuleBase):
         return self.guided
 
     def _after_the_last_achieved(self, state: Tensor, top: Tensor) -> Tensor:
-        """Returns the stage after the last one below the top, [B, 1], whose goal is achieved in each row."""
+        """Returns the stage after the last one whose goal a row achieves, [B, 1]; 0 if it achieves none."""
         after = torch.zeros_like(top)
         for stage in range(len(self.curriculum) - 1):
             after = torch.where(self._achieved(state, torch.full_like(top, stage)), stage + 1, after)
@@ -206,7 +206,7 @@ class GuidedExploration(TensorDictModuleBase):
         return ((achieved - desired).square().sum(-1) < squares).view(stage.shape)
 
     def _look(self, state: Tensor, stage: Tensor) -> tuple[Tensor, ...]:
-        """Returns network input, achieved and desired goal of each row, as the row's given stage has them."""
+        """Returns the network input, achieved goal and desired goal of each row in the stage given for it."""
         index = self._columns.to(state.device)[stage.flatten().clamp(min=0)]
         entries = take_columns(self.curriculum.extend(state), index)
         goal = self.curriculum.goal_width

@@ -27,7 +27,7 @@ def count_inputs(
 ) -> Callable[[], None]:
     """Adds the networks' inputs in written transitions to the statistics; see :class:`~torchrl_her.ZeroPad`.
 
-    Hand it to the writer as ``HERWriter(on_write=functools.partial(count_inputs, norm, progress))``. Inputs
+    Pass it to the writer as ``HERWriter(on_write=functools.partial(count_inputs, norm, progress))``. Inputs
     that a stage does not use are left out. In the buffer, :class:`~torchrl_her.modules.NormalizeBatch` comes
     after ``ZeroPad``.
 
@@ -41,7 +41,7 @@ def count_inputs(
     Keyword Args:
         keys: keys of observation and desired goal, which are read.
         input_key: key of the input, in ``norm``.
-        stage_key: key of the stage that each row carries, if episodes have stages of their own.
+        stage_key: key of the stage of each row, if episodes have stages of their own.
 
     Returns:
         A function that undoes the call.

@@ -33,7 +33,7 @@ class CurriculumStage:
         name: name of the stage, for messages and reports.
         observation, achieved_goal, desired_goal: indices into the state vector, or names that the argument
             ``names`` of :class:`~torchrl_her.Curriculum` translates to indices.
-        constant_goal: one goal for all episodes, as a gap in a wall, in place of ``desired_goal``; in the
+        constant_goal: one goal for all episodes, like a gap in a wall, in place of ``desired_goal``; in the
             unit of the achieved goal.
         threshold: the goal is achieved at distances below this, in the unit of the state. The last stage,
             which is the environment's own task, needs no threshold: its goals are relabeled by the reward
@@ -92,13 +92,13 @@ class CurriculumStage:
         return GoalReward(self.threshold, missed_reward=missed, achieved_reward=achieved)
 
     def _check_indices(self) -> None:
-        """Checks the indices of a stage whose names are resolved, except against the width of the state."""
+        """Checks a stage's indices, except against the width of the state, which :class:`Curriculum` does."""
         for key in _LISTS:
             entries = getattr(self, key)
             if min(entries, default=0) < 0:
                 raise ValueError(f"stage {self.name!r}: {key} must have indices of at least 0, got {entries}")
             if len(set(entries)) < len(entries):
-                raise ValueError(f"stage {self.name!r}: {key} must have each index once, got {entries}")
+                raise ValueError(f"stage {self.name!r}: {key} must not repeat an index, got {entries}")
         for key in ("observation", "achieved_goal"):  # these may share entries, but not with the desired goal
             shared = sorted(set(self.desired_goal) & set(getattr(self, key)))
             if shared:
@@ -108,7 +108,7 @@ class CurriculumStage:
         goal = self.desired_goal or self.constant_goal
         if len(self.achieved_goal) != len(goal):
             raise ValueError(
-                f"stage {self.name!r}: achieved_goal and the goal must be of one width, "
+                f"stage {self.name!r}: achieved_goal and the goal must have the same width, "
                 f"got {self.achieved_goal} and {goal}"
             )
 
@@ -218,7 +218,7 @@ class Curriculum:
         return extended
 
     def show(self, state: Tensor, stage: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Returns the observation, the achieved and the desired goal of states as a stage shows them.
+        """Returns the observation, the achieved and the desired goal that a stage selects from states.
 
         Args:
             state: [..., state_width], state vectors.
@@ -253,12 +253,12 @@ class Curriculum:
         return [*self.padded(stage.observation, self.observation_width), *self.goal_index(stage)]
 
     def goal_index(self, stage: CurriculumStage) -> list[Any]:
-        """Returns the indices of a stage's achieved and desired goal, each filled up with a zero's index."""
+        """Returns the indices of a stage's achieved and desired goal, each :meth:`padded` to one width."""
         goals = (stage.achieved_goal, stage.desired_goal)
         return [index for goal in goals for index in self.padded(goal, self.goal_width)]
 
     def padded(self, indices: Indices, width: int) -> list[Any]:
-        """Returns indices into the extended state, filled up to a width with the index of its zero."""
+        """Pads indices into the extended state to a width, with the index of the zero in that state."""
         return [*indices, *[self.state_width] * (width - len(indices))]
 
     def _input_index(self, stage: CurriculumStage) -> list[int]:
@@ -287,8 +287,8 @@ class CurriculumProgress:
     """Progress of R independent runs: the stage that each is in, and its recent successes there.
 
     A run moves to the next stage when the mean of its last ``window`` samples of success reaches the
-    threshold. The window is then cleared, so that samples of earlier stages never count. The last stage has
-    no end.
+    threshold. The window is then cleared, so that samples of earlier stages never count. The last stage
+    never ends.
 
     Args:
         curriculum: the stages.
@@ -422,9 +422,9 @@ class CurriculumProgress:
         """
         stages = tuple(state["stage"].tolist())
         if len(stages) != self.runs:
-            raise ValueError(f"the state is of {len(stages)} runs, but there are {self.runs}")
+            raise ValueError(f"the state must have {self.runs} runs, got {len(stages)}")
         if not all(0 <= stage < len(self.curriculum) for stage in stages):
-            raise ValueError(f"the state's stages are {stages}, but there are {len(self.curriculum)} stages")
+            raise ValueError(f"stages in the state must be in [0, {len(self.curriculum) - 1}], got {stages}")
         self.stages = stages
         self._successes = [list(samples)[-self.window :] for samples in state["successes"]]
         self._evaluations = list(state["evaluations"])

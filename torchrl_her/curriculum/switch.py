@@ -12,7 +12,7 @@ from torchrl_her.replay_buffers.writer import HERWriter
 
 
 def set_stage_goals(writer: Writer, stage: CurriculumStage, *, run: int = 0) -> None:
-    """Sets the reward by which a writer relabels a run, and whether IBS weights apply, as a stage has them.
+    """Sets a writer's reward function for a run, and whether IBS weights apply, to those of a stage.
 
     Args:
         writer: writer of one run or several.

@@ -41,7 +41,7 @@ class _StageTransform(Transform):
         stage_key: NestedKey,
     ) -> None:
         if progress.curriculum is not curriculum:
-            raise ValueError("progress must be made of the same curriculum, got one of another")
+            raise ValueError("progress must have the same curriculum object as this transform")
         if run is not None and not 0 <= run < progress.runs:
             raise ValueError(f"run must be None or in [0, {progress.runs - 1}], got {run}")
         super().__init__(in_keys=in_keys, out_keys=out_keys)
@@ -58,13 +58,13 @@ class _StageTransform(Transform):
         return stages[:1] if stages.count(stages[0]) == len(stages) else stages
 
     def _rows_stages(self, tensordict: TensorDictBase) -> Tensor | None:
-        """Returns the stage [...] that each row carries; None if each run has one stage."""
+        """Returns the stage [...] in which each row was played; None if each run has one stage."""
         if not self.progress.by_episode:
             return None
         return self._get(tensordict, self.stage_key, 1).squeeze(-1)
 
     def _columns(self, columns: Tensor, rows: Tensor | None, device: torch.device) -> Tensor:
-        """Selects the columns [B, n] of B blocks, or of B rows, from those of all stages, [stages, n]."""
+        """Selects columns [B, n] for B blocks or B rows from a table with the columns of each stage."""
         stages = self._stages() if rows is None else tuple(range(len(self.curriculum)))
         made_for = stages, device
         if self._table[0] != made_for:
@@ -76,7 +76,7 @@ class _StageTransform(Transform):
         check_blocks(shape[:-1], self.progress.runs if self.run is None else 1)
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        if self._shown_in is None:  # first reset only: in a partial one, other rows keep their stage
+        if self._shown_in is None:  # first reset only: later ones may reset a part of the rows
             self._shown_in = self.progress.stages
         return self._call(tensordict_reset)
 
@@ -123,8 +123,8 @@ class StateToObs(_StageTransform):
     ``observation`` always has the width of the last stage: the entries of the present stage, then zeros.
 
     The last stage is the environment's own task: its reward and its ends stay as they are. In the stages
-    below, ``next`` gets the reward and ``terminated`` of the stage's ``reward_fn``: 0 and an end where the
-    goal is nearer than the stage's threshold, -1 elsewhere. ``done`` becomes ``terminated | truncated``.
+    below, ``next`` gets reward and ``terminated`` of the stage's ``reward_fn``: 0 and True where the goal is
+    nearer than the stage's threshold, -1 and False elsewhere. ``done`` becomes ``terminated | truncated``.
     ``truncated`` stays as it was, so the environment must set it at its time limit even if its own goal is
     achieved.
 
@@ -155,7 +155,7 @@ class StateToObs(_StageTransform):
     Keyword Args:
         state_key: the state vector, which is read.
         keys: keys of the entries that are written. The flag ``truncated`` is read; its key is None if the
-            environment below has no time limit (a StepCounter after this transform may add one).
+            environment has no time limit (a StepCounter after this transform may add one).
         stage_key: key under which the stage of each row is written, [..., 1] of int64, if episodes have
             stages of their own (:class:`~torchrl_her.curriculum.EpisodeStages`).
         continues_after_termination: whether the environment can be stepped further after it terminated an
@@ -380,7 +380,7 @@ class ZeroPad(_StageTransform):
             dimension is R equal blocks, in the order of the runs.
         keys: keys of observation and desired goal, which are read.
         input_key: key of the network's input, which is written.
-        stage_key: key of the stage [..., 1] that each row carries, if episodes have stages of their own
+        stage_key: key of the stage [..., 1] of each row, if episodes have stages of their own
             (:class:`~torchrl_her.curriculum.EpisodeStages`).
 
     Raises:

@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase
 from torchrl_her.demonstrations.dataset import Demonstrations
 from torchrl_her.trainers.trainer import evaluate
 
-_COUNTED = ("key", "step", "episode")  # counters and random keys, which are no physical state
+_COUNTED = ("key", "step", "episode")  # left out: counters and random keys are no physical state
 
 
 def demonstrate(

@@ -39,7 +39,7 @@ def write_demonstrations(
 
 
 def demonstration_rows(share: float, batch_size: int) -> int:
-    """Number of demonstrations in a batch: the share of its rows, rounded, but at least one and not all.
+    """Number of demonstrations in a batch: the share of its rows, rounded, from 1 to all rows but one.
 
     Example:
         >>> demonstration_rows(0.125, 256), demonstration_rows(0.001, 256)
@@ -48,7 +48,7 @@ def demonstration_rows(share: float, batch_size: int) -> int:
     if not 0.0 < share < 1.0:
         raise ValueError(f"share must be in (0, 1), got {share}")
     if batch_size < 2:
-        raise ValueError(f"batch_size must be at least 2 for batches of two kinds, got {batch_size}")
+        raise ValueError(f"batch_size must be at least 2 to mix two kinds of rows, got {batch_size}")
     return min(max(1, round(share * batch_size)), batch_size - 1)
 
 
@@ -123,7 +123,7 @@ class MixedReplay:
         steps, rest = divmod(batch_size, self.runs * self.batch_size)
         if rest or not steps:
             raise ValueError(
-                f"{batch_size} rows are no whole number of batches of {self.batch_size} for {self.runs} runs"
+                f"batch_size must be a positive multiple of {self.runs * self.batch_size}, got {batch_size}"
             )
         if not all(sizes_of(self.demonstrations)):
             raise RuntimeError("some runs have no demonstrations: write them with write_demonstrations")

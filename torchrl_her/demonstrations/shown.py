@@ -16,7 +16,7 @@ def with_reward(demonstrations: Demonstrations, reward_fn: RewardFunction) -> De
     """Recomputes the rewards and ends of demonstrations; each is cut at the first step that terminates it.
 
     A demonstration that no longer terminates is truncated at its end. If it had terminated without achieving
-    its goal, as by a fall, it still terminates at that step.
+    its goal, such as by a fall, it still terminates at that step.
 
     Args:
         demonstrations: the recorded demonstrations.

@@ -75,7 +75,7 @@ class DemonstrationStarts(Transform):
         single = isinstance(demonstrations, Demonstrations)
         per_run = [demonstrations] * runs if isinstance(demonstrations, Demonstrations) else demonstrations
         if len(per_run) != runs or (generators is not None and len(generators) != runs):
-            raise ValueError(f"{runs} runs need demonstrations and a generator for each, got {len(per_run)}")
+            raise ValueError(f"{runs} runs need {runs} demonstrations and generators, got {len(per_run)}")
         first = usable(per_run[0])
         self._shown = [first if single else usable(demos) for demos in per_run]
         self.share, self.runs = share, runs
@@ -85,7 +85,7 @@ class DemonstrationStarts(Transform):
         self._asks_elsewhere = False
 
     def show(self, demonstrations: Demonstrations, *, run: int = 0) -> None:
-        """Replaces a run's demonstrations, as in its next stage, and moves its starts near the end again."""
+        """Replaces a run's demonstrations, as for a new stage, and moves its starts near the end again."""
         self._shown[run] = usable(demonstrations)
         self.walk.restart(run, int(self._shown[run].lengths.max()))
 
@@ -121,7 +121,7 @@ class DemonstrationStarts(Transform):
         env = self._environment()
         count = tensordict_reset.batch_size.numel()
         if count % self.runs:
-            raise ValueError(f"{count} environments cannot be shared out among {self.runs} runs")
+            raise ValueError(f"a batch must have a multiple of runs={self.runs} environments, got {count}")
         mask = tensordict.get("_reset", None)
         begun = torch.ones(count, dtype=torch.bool) if mask is None else mask.flatten()
         if self._back is None or len(self._back) != count:

@@ -84,6 +84,6 @@ class WalkBack:
             ValueError: the state has another number of runs.
         """
         if len(state["back"]) != len(self.back):
-            raise ValueError(f"the state is of {len(state['back'])} runs, not of {len(self.back)}")
+            raise ValueError(f"the state must have {len(self.back)} runs, got {len(state['back'])}")
         self.back, self._longest = list(state["back"]), list(state["longest"])
         self._outcomes = [list(run_outcomes) for run_outcomes in state["outcomes"]]

@@ -26,7 +26,7 @@ _REPEATED = 1 << 24  # number of elements by which tensors, as expanded views, m
 # last record begins. If these contradict each other, zipfile and torch may read different lists.
 _END = struct.Struct("<4s36xQQ4s4xQ4x4s16xH")
 _MARKS = (b"PK\6\6", b"PK\6\7", b"PK\5\6")
-# torch ignores case in the names of records, so the names that hold tensors must be numbers.
+# torch ignores case in the names of records; those of tensors must be digits, which have no case.
 _RECORD = re.compile(r"[^/\0]+/(data\.pkl|data/[0-9]+|\.?\w+|\.data/\w+)", re.ASCII)
 _NAMES = {
     "collections OrderedDict",
@@ -38,9 +38,9 @@ _NAMES = {
     *(f"torch {name}" for name in dir(torch) if name.endswith("Storage")),
     *(f"torch {name}" for name in dir(torch) if isinstance(getattr(torch, name), torch.dtype)),
 }
-_NAME, _STORAGE = -1, 6  # marks a name; size of the tuple ("storage", type, key, device, count)
+_NAME, _STORAGE = -1, 6  # size that marks a name; size of ("storage", type, key, device, count)
 _SIZES = {"GLOBAL": _NAME, "BINPERSID": _STORAGE}
-_NEEDS = {"REDUCE": _NAME, "NEWOBJ": _NAME, "BINPERSID": _STORAGE}  # size of an opcode's first operand
+_NEEDS = {"REDUCE": _NAME, "NEWOBJ": _NAME, "BINPERSID": _STORAGE}  # what an opcode's first operand must be
 _PLAIN = (bool, int, float, str, type(None), torch.dtype, dict, list, tuple)
 
 
@@ -122,7 +122,7 @@ def _check_archive(file: BinaryIO, begin: int) -> None:
     names = [record.orig_filename for record in records]
     for record, name in zip(records, names, strict=True):
         if not _RECORD.fullmatch(name) or name.partition("/")[0] != names[0].partition("/")[0]:
-            raise _RefusedError(f"torch.save writes no record {name[:80]!r}")
+            raise _RefusedError(f"it has the record {name[:80]!r}, which torch.save never writes")
         if record.compress_type != ZIP_STORED:
             raise _RefusedError(f"its record {name[:80]!r} is compressed")
     if len({name.lower() for name in names}) < len(names):
@@ -134,9 +134,9 @@ def _check_archive(file: BinaryIO, begin: int) -> None:
 def _check_description(description: bytes) -> None:
     """Refuses a pickle that calls anything but constructors of tensors, or whose tuples expand too far.
 
-    A tuple that holds a second tuple twice, which holds a third one twice, and so on, takes few bytes, but
-    hashing it takes time for all entries written out. Printing such lists in an error would, too, so the
-    operands that torch would print are checked.
+    A tuple that holds a second tuple twice, which holds a third one twice, and so on, takes few bytes. But
+    hashing it takes as long as if all entries were written out. So does printing such lists in an error
+    message, so the operands that torch would print are checked, too.
 
     Raises:
         MoreThanDataError: the pickle names more than tensors and plain data.
@@ -156,7 +156,7 @@ def _check_description(description: bytes) -> None:
         place = marks.pop() - before.index(markobject) if markobject in before else len(stack) - len(before)
         parts, stack[place:] = stack[place:], []
         if name in _NEEDS and parts[0] != _NEEDS[name]:
-            raise _RefusedError(f"its description is damaged: {name} of a value")
+            raise _RefusedError(f"its description is damaged: {name} has a wrong operand")
         if "PUT" in name:
             memo[value] = stack[-1]
         size = 1

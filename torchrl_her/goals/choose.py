@@ -32,7 +32,7 @@ class Candidates(NamedTuple):
         goals: [p, g], the goals of all lines.
         table: [L, W] int64, positions in ``goals``; shorter lines are padded with their last position.
         line: [n] int64, ascending: the line of each transition.
-        first, end: [n] int64: which places of its line a transition may take, ``first <= place < end``.
+        first, end: [n] int64: the places in its line that a transition may take, ``first <= place < end``.
     """
 
     goals: Tensor
@@ -160,7 +160,7 @@ def _propose(candidates: Candidates, k: int, weight: Tensor | None, draws: RunDr
         return x.new_zeros(len(counts), longest, *x.shape[1:]).index_put_((line, place), x)
 
     def numbers(_: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
-        """Returns random numbers; none is drawn for padding, whose size depends on the other lines."""
+        """Returns random numbers for transitions, and 0 for padding, whose size other lines determine."""
         return by_line(draws((n, k), dtype, device))
 
     drawn = draw_weighted(weight, by_line(first), by_line(end), k, generator=numbers)

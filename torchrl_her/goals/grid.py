@@ -18,7 +18,7 @@ from torchrl_her.checks import check_finite
 
 _MAX_CELLS = 1 << 24  # most cells of a grid: a float64 table takes 128 MiB, and five are kept
 _CHUNK = 1 << 21  # number of kernel values that are computed at once when summing over samples
-_THIN = 1e-4  # width of a box, in sigmas, below which differences over it would lose digits
+_THIN = 1e-4  # boxes thinner than this, in sigmas, are not integrated by differences
 
 Numbers = float | Sequence[float] | Tensor
 

@@ -104,7 +104,7 @@ class RareGoals(GoalWeights):
         self._reference = None
         known = new[:0].clone() if self.goals is None else self.goals.to(new.device)
         if known.shape[1] != new.shape[1]:
-            raise ValueError(f"goals of {known.shape[1]} numbers are remembered, got goals of {new.shape[1]}")
+            raise ValueError(f"goals must have {known.shape[1]} numbers, as earlier ones, got {new.shape[1]}")
         more = min(self.memory - len(known), len(new))
         place = (torch.arange(len(new) - more, device=new.device) + self._next) % self.memory
         known = torch.cat([known, new[:more].to(known.dtype)]) if more else known
@@ -120,7 +120,7 @@ class RareGoals(GoalWeights):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         goals = state["goals"]
         if goals is not None and len(goals) > self.memory:
-            raise ValueError(f"memory={self.memory} goals fit, the state has {len(goals)}")
+            raise ValueError(f"the state must have at most memory={self.memory} goals, got {len(goals)}")
         self.goals, self._next, self._reference = (
             None if goals is None else goals.clone(),
             state["next"],

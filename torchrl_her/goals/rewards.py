@@ -15,7 +15,7 @@ from torchrl_her.checks import check_finite
 
 _FORM = (
     "the reward function must take (achieved_goal, desired_goal) and return (reward, terminated), "
-    "tensors [..., 1]; one that reads further entries comes as EnvReward(function, info_keys=[...])"
+    "tensors [..., 1]; wrap one that reads further entries as EnvReward(function, info_keys=[...])"
 )
 # Achieved goals [..., g], or a tensordict of goals and info if the reward function reads further entries.
 Outcome: TypeAlias = Tensor | TensorDictBase
@@ -28,8 +28,8 @@ class RewardFunction(Protocol):
     The achieved goal comes first, as in gymnasium's ``compute_reward``. A function that has an attribute
     ``info_keys`` gets a third argument, the info: a tensordict of these entries of the transition, whose
     dimensions [...] are broadcast against those of the goals. Entries are read under ``next``, or in the root
-    if ``next`` lacks them, as it lacks ``action``. For the goals achieved before the action, which the filter
-    of relabeling asks about, they are read in the root first.
+    if ``next`` lacks them, as it lacks ``action``. When the relabeling filter calls the function for goals
+    that were achieved before the action, entries are read in the root first.
     """
 
     def __call__(self, achieved_goal: Tensor, desired_goal: Tensor, /) -> tuple[Tensor, Tensor]: ...
@@ -226,8 +226,8 @@ def _call(reward_fn: RewardFunction, achieved: Outcome, desired_goal: Tensor) ->
         return reward, terminated
     kinds = " and ".join(type(value).__name__ for value in several)
     raise ValueError(
-        f"{_FORM}, got {kinds}; a function of rewards alone comes as EnvReward(function), where no goal ends "
-        "an episode"
+        f"{_FORM}, got {kinds}; wrap a function that returns only rewards as EnvReward(function): then no "
+        "goal ends an episode"
     )
 
 
@@ -282,7 +282,7 @@ def missed(
 
 
 def ends_at_goals(reward_fn: RewardFunction, goals: Outcome) -> bool:
-    """Returns whether an achieved goal ends an episode; if info is read, whether it does for some info.
+    """Returns whether achieving a goal ends an episode, at least for some of the infos that are read.
 
     Args:
         reward_fn: maps (achieved, desired) goals to (reward, terminated).

@@ -39,12 +39,12 @@ class NetworkNovelty(GoalWeights):
     Keyword Args:
         seed: seed of both networks.
         sharpness: weights are ``error ** sharpness``, of the squared error.
-        hidden: width of the hidden layers, of which the target has one and the predictor two.
+        hidden: width of the hidden layers: one in the random network, two in the predictor.
         features: number of outputs of the networks.
         lr: learning rate of the predictor (Adam).
         steps: gradient steps for the goals of one ``update``, at most.
-        batch_size: goals of a gradient step, at most. If all steps together take fewer goals than there are,
-            a part that is spread evenly over them is used.
+        batch_size: goals of a gradient step, at most. If there are more goals than all steps together take,
+            an evenly spread part of the goals is used.
 
     Raises:
         ValueError: an option is out of its range, or goals have another width than earlier ones.
@@ -154,7 +154,7 @@ class NetworkNovelty(GoalWeights):
             return None
         mean = learned.loss.obs_rms.mean
         if len(mean) != goals.shape[-1]:
-            raise ValueError(f"goals of {len(mean)} numbers were learned, got goals of {goals.shape[-1]}")
+            raise ValueError(f"goals must have {len(mean)} numbers, as earlier ones, got {goals.shape[-1]}")
         if mean.device != goals.device:
             self._learned = self._with_optimizer(learned.loss.to(goals.device))
             self._learned.optimizer.load_state_dict(learned.optimizer.state_dict())

@@ -151,7 +151,7 @@ def check_goal_sources(sources: GoalSources) -> dict[Strategy, int]:
         TypeError: ``sources`` is not a mapping from sources to numbers.
     """
     if not isinstance(sources, Mapping):
-        raise TypeError(f"goal_sources must be numbers by source, as in {{'future': 4}}, got {sources!r}")
+        raise TypeError(f"goal_sources must map sources to numbers, as in {{'future': 4}}, got {sources!r}")
     if not sources:
         raise ValueError("goal_sources needs at least one source, as in {'future': 4}; k=0 asks for no goals")
     checked: dict[Strategy, int] = {}

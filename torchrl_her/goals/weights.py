@@ -100,7 +100,7 @@ def weights_by_run(weights: GoalWeights | Sequence[GoalWeights] | None, runs: in
     run_weights = list(weights) if isinstance(weights, Sequence) else [] if weights is None else [weights]
     if run_weights and len(run_weights) != runs:
         raise ValueError(
-            f"{runs} runs need a list of {runs} weights, one of each run, got {len(run_weights)}"
+            f"{runs} runs need a list of {runs} weights, one for each run, got {len(run_weights)}"
         )
     return run_weights
 

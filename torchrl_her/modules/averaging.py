@@ -19,7 +19,7 @@ class PolicyAverage(nn.Module):
 
     At first the decay is ``(1 + n) / (10 + n)`` after n steps, so that the first weights are soon forgotten.
     Buffers, such as running statistics, are copied. Unlike in torch's ``AveragedModel``, one call covers many
-    gradient steps. It takes next to no time, since it may be called every few milliseconds.
+    gradient steps. A call takes so little time that it can be made every few milliseconds.
 
     Args:
         policy: the policy that is trained.

@@ -146,7 +146,7 @@ class Exploration(TensorDictModuleBase):
         greedy = tensordict.get(key)
         runs = len(self.generators)
         if len(greedy) % runs:
-            raise ValueError(f"{len(greedy)} rows cannot be shared out among {runs} runs")
+            raise ValueError(f"the number of rows must be a multiple of runs={runs}, got {len(greedy)}")
         blocks = greedy.chunk(runs)
         actions = [
             self._explore(block, epsilon, generator)

@@ -126,9 +126,9 @@ class NormalizedPolicy(TensorDictModuleBase):
         reads, writes = ({unravel_key(key) for key in keys} for keys in (actor.in_keys, actor.out_keys))
         self._normalized = [key for key in norm.keys if key in reads]
         if not self._normalized:
-            raise ValueError(f"the actor reads {actor.in_keys}, of which none is normalized: {norm.keys}")
+            raise ValueError(f"the actor must read a normalized entry, {norm.keys}, got {actor.in_keys}")
         if both := [key for key in norm.keys if key in writes]:
-            raise ValueError(f"the actor must not write what is normalized, got {both}")
+            raise ValueError(f"the actor must not write normalized entries, got {both}")
         self.in_keys, self.out_keys = actor.in_keys, actor.out_keys
         self.actor, self.norm = actor, norm
 

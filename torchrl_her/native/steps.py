@@ -25,7 +25,7 @@ def load_steps(dtype: torch.dtype) -> Any:
         CannotCompile: see :func:`~torchrl_her.native.load_library`.
     """
     if dtype not in _TYPES:
-        raise CannotCompile(f"there are steps for {', '.join(map(str, _TYPES))}, got {dtype}")
+        raise CannotCompile(f"compiled gradient steps need {', '.join(map(str, _TYPES))}, got {dtype}")
     library = load_library("steps.cpp", headers=("gemm.h", "network.h"), real=_TYPES[dtype])
     assert library.her_job_size() == ctypes.sizeof(structures(dtype).job)
     library.her_steps.restype = None

@@ -18,9 +18,9 @@ def action_cost(action: Tensor, *, l2: float = 0.0, saturation: float = 0.0) -> 
     """Cost of actions in an actor's loss: their mean square, and how far they are saturated.
 
     An actor that ends in tanh gets no gradient where its actions are at their bounds. The action L2 penalty
-    of OpenAI's HER prevents that by pulling all actions towards 0, but then an actor whose critic cannot tell
-    actions apart yet learns to stand still. The saturation penalty acts only where ``|atanh(action)|`` is
-    above 2, with a slope that tanh does not flatten, and leaves all other actions free.
+    of OpenAI's HER prevents that by pulling all actions towards 0. But as long as the critic gives all
+    actions about the same value, the actor then learns to stand still. The saturation penalty acts only
+    where ``|atanh(action)|`` is above 2, with a slope that tanh does not flatten.
 
     Args:
         action: [..., a], from -1 to 1.

@@ -130,13 +130,13 @@ def as_critics(
     check_whole(critics=len(every))
     for module in every:
         if any(isinstance(layer, StackedBatchNorm) for layer in module.modules()):
-            raise ValueError("norm must be none or layer in critics of this loss, got 'batch'; DDPG has it")
+            raise ValueError("norm must be none or layer in critics of this loss, got 'batch' (DDPG only)")
     number = 2 if isinstance(critic, TensorDictModule) else len(every)
     return every if len(every) > 1 else every[0], number
 
 
 def connect_critics(loss: LossModule, critic: TensorDictModule | Sequence[TensorDictModule]) -> None:
-    """Sets the key of a loss's values, and restores the weights of a critic from a list of one.
+    """Sets the key of a loss's values, and copies the weights of a critic that came in a list of one.
 
     Args:
         loss: loss that was made with the result of :func:`as_critics`.
@@ -146,6 +146,6 @@ def connect_critics(loss: LossModule, critic: TensorDictModule | Sequence[Tensor
     if isinstance(critic, TensorDictModule) or len(critic) > 1:
         return
     weights = TensorDict.from_module(critic[0]).data.unsqueeze(0)
-    for name, params in loss.named_children():  # not as attributes: TorchRL would warn about targets
+    for name, params in loss.named_children():  # reading attributes makes TorchRL warn about targets
         if name in ("qvalue_network_params", "target_qvalue_network_params"):
             params.data.update_(weights)

@@ -40,7 +40,7 @@ class PenalizedTQCLoss(PenalizedSACLoss, TQCLoss):
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         if "target_critics" in kwargs:
             raise TypeError(
-                "TQC's targets have the quantiles of all critics, of which none are drawn at random: "
+                "TQC's targets use the quantiles of all critics, not of some that are drawn at random: "
                 f"leave out target_critics={kwargs['target_critics']!r}"
             )
         super().__init__(*args, **kwargs)

@@ -41,7 +41,7 @@ class EnvIds(Transform):
     def __init__(self, key: NestedKey = "env_ids") -> None:
         super().__init__(in_keys=[], out_keys=[key])
         self._ids: Tensor | None = None
-        self._process = 0  # process that drew the ids: a fork has other environments
+        self._process = 0  # process that drew the ids; a forked one draws new ids
 
     def _own_ids(self, tensordict: TensorDictBase) -> Tensor:
         shape = (*tensordict.batch_size, 1)

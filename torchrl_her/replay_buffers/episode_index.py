@@ -14,7 +14,7 @@ from torch import Tensor
 class EpisodeIndex:
     """Index of the episodes in a ring buffer: converts rows of the storage to places in episodes, and back.
 
-    A row is a stored transition. A stream is all rows of one environment. A run is a stretch of a stream
+    A row is a stored transition. A stream is all rows of one environment. A segment is a stretch of a stream
     whose rows belong to one episode without a break. Each row has a *position*, its index if rows are sorted
     by stream and then by time, and a *place*, its index if all rows of an episode follow each other.
 
@@ -22,10 +22,10 @@ class EpisodeIndex:
         slots: T, the number of filled slots of the ring.
         streams: N, the number of rows in each slot; the row of a stream in a slot is ``slot * N + stream``.
         oldest: slot of the oldest rows.
-        begins: [R] int64, positions at which runs begin, ascending.
-        places: [R] int64, the places of the rows at ``begins``.
-        ordered_begins: [R] int64, ``begins`` in the order of episodes.
-        ordered_places: [R] int64, ``places`` in the order of episodes, ascending.
+        begins: [S] int64, positions at which segments begin, ascending.
+        places: [S] int64, the places of the rows at ``begins``.
+        ordered_begins: [S] int64, ``begins`` in the order of episodes.
+        ordered_places: [S] int64, ``places`` in the order of episodes, ascending.
         first: [E + 1] int64, places at which episodes begin, and the number of all rows.
     """
 
@@ -78,17 +78,17 @@ def index_episodes(
     """Finds the episodes of a ring buffer.
 
     An episode ends with a row that is done, before a row of its stream with another trajectory id, or with
-    the newest row. In flat storages, rows with the same id belong together wherever they lie, since a
-    collector's batches, flattened, hold a stretch of each environment in turn. Without ids, flat rows are
-    one stream.
+    the newest row. In flat storages, rows with the same id belong together even if other rows lie between
+    them, since a flattened batch of a collector has some steps of each environment, one environment after
+    the other. Without ids, flat rows are one stream.
 
     Args:
         done: [T, N] of bool, time first, N environments; or flat, [T].
         trajectory: ids of the trajectories, integers of the same shape.
         oldest: slot of the oldest row: 0 until the ring is full, then the slot that is overwritten next.
-        seams: pairs of entries [n, g] of the rows, from after and from before the action: within an episode,
-            the first entry of a row equals the second entry of the next row. An episode ends where these
-            differ, as a second collector uses the same id, or another environment's rows follow.
+        seams: pairs of entries [n, g] of rows, after the action and before it. Within an episode, the first
+            entry of a row equals the second entry of the next row. Where they differ, the episode ends, since
+            rows of another collector with the same id, or of another environment, follow.
 
     Returns:
         The index. An episode that was partly overwritten consists of the rows that are left.
@@ -132,6 +132,6 @@ def index_episodes(
 
 
 def _differ(one: Tensor, other: Tensor) -> Tensor:
-    """Returns a mask [...] of vectors [..., g] that differ, coordinate by coordinate, which saves time."""
+    """Returns a mask [...] of pairs of vectors [..., g] that differ; a loop over coordinates is fastest."""
     pairs = zip(one.unbind(-1), other.unbind(-1), strict=True)
     return reduce(torch.logical_or, [a != b for a, b in pairs])

@@ -43,7 +43,7 @@ def time_order(streams: Tensor) -> Tensor:
         return streams.argsort(stable=True)
     return torch.arange(
         len(streams), device=streams.device
-    )  # not sorted, which takes long: a batch [N, T] comes in order
+    )  # a batch [N, T] is in order already, and sorting takes long
 
 
 def find_episodes(streams: Tensor, end: Tensor, order: Tensor | None = None) -> tuple[Episodes, Tensor]:

@@ -78,7 +78,7 @@ class TransitionKeys:
     def rewards(
         self, rows: TensorDictBase, reward_fn: RewardFunction, achieved_reward: float
     ) -> tuple[Tensor, Tensor]:
-        """Returns rewards [n] by a reward function, with the cost of failures, and the collected rewards."""
+        """Returns the rewards [n] of a function plus the costs of failures, and the collected rewards [n]."""
         computed, _ = ask_reward(reward_fn, self.after(rows, reward_fn), entry_of(rows, self.goals[1]))
         cost = failures(rows, self, reward_fn, achieved_reward)[1]
         return (computed + cost).flatten(), entry_of(rows, self.reward).flatten()
@@ -104,7 +104,7 @@ class TransitionKeys:
 def failures(
     transitions: TensorDictBase, keys: TransitionKeys, reward_fn: RewardFunction, achieved_reward: float
 ) -> tuple[Tensor, Tensor]:
-    """Returns where an episode terminated without its goal, as by a fall, and the cost of that.
+    """Returns where an episode terminated without achieving its goal, such as by a fall, and the cost.
 
     Such an end and its cost do not depend on the goal, so virtual transitions have both, too.
 
@@ -188,6 +188,6 @@ def stored_as(value: Tensor, entry: Tensor, key: NestedKey) -> Tensor:
         lost = value[out.to(value.dtype) != value]
         if len(lost) > 0:
             raise ValueError(
-                f"{key!r} is of {entry.dtype}, which cannot hold {lost[0].item()}: collect {value.dtype}"
+                f"{key!r} is of {entry.dtype}, which cannot hold {lost[0].item()}: use {value.dtype}"
             )
     return out.view(-1, *entry.shape[1:])

@@ -1,4 +1,4 @@
-"""Refuses parts of a replay buffer beside which relabeling would be wrong without an error."""
+"""Refuses parts of a replay buffer with which relabeling would silently give wrong results."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def samplers_of(storage: Storage) -> Iterator[Sampler]:
 def refuse_beside_writer(
     name: str, storage: Storage, transitions: TensorDictBase, options: HindsightOptions, *, runs: int
 ) -> None:
-    """Raises a ValueError for a storage, sampler or batch with which a writer of R runs would be wrong."""
+    """Raises a ValueError if a storage, sampler or batch does not fit a writer of R runs."""
     refuse_padded(name, transitions)
     if storage.ndim > 1:
         raise ValueError(f"{name} needs a storage of 1 dimension, got one of {storage.ndim}")
@@ -86,11 +86,11 @@ def refuse_padded(name: str, transitions: TensorDictBase) -> None:
 
 
 def refuse_stages(name: str, transitions: TensorDictBase, options: HindsightOptions) -> None:
-    """Raises a ValueError if transitions carry a stage although one reward relabels all stages."""
+    """Raises a ValueError if transitions have stages, since one reward would relabel all of them."""
     if options.k > 0 and options.stage_key in transitions.keys(True):
         raise ValueError(
-            f"{name} got transitions that carry their stage ({options.stage_key!r}), and has one reward for "
-            "all of them: use HERWriter(stages=[...]), or another stage_key if that entry is something else"
+            f"{name} got transitions with a stage ({options.stage_key!r}), but has one reward for all "
+            "stages: use HERWriter(stages=[...]), or another stage_key if that entry is something else"
         )
 
 
@@ -116,19 +116,19 @@ def has_slices(storage: Storage) -> bool:
 def refuse_slices(name: str, storage: Storage) -> None:
     """Raises a ValueError if TorchRL samples wrong sequences from a storage of this kind.
 
-    A sampler of slices writes its marks into the rows of a list storage. In a full storage of several
+    A sampler of slices marks their ends in the stored rows of a list storage. In a full storage of several
     dimensions, the slices of a prioritized sampler are no sequences.
     """
     if isinstance(storage, ListStorage) and has_slices(storage):
         raise ValueError(
-            f"{name} cannot work with slices of a {type(storage).__name__}, into which the sampler would "
-            "write where they end: use a LazyTensorStorage"
+            f"{name} cannot work with slices of a {type(storage).__name__}: the sampler would mark their "
+            "ends in its stored rows; use a LazyTensorStorage"
         )
     by_priority = any(isinstance(sampler, PrioritizedSliceSampler) for sampler in samplers_of(storage))
     if storage.ndim > 1 and by_priority:
         raise ValueError(
             f"{name} cannot work with a PrioritizedSliceSampler over a storage of {storage.ndim} "
-            "dimensions: it finds no sequences once that is full; use ndim=1"
+            "dimensions: it finds no sequences once the storage is full; use ndim=1"
         )
 
 
@@ -137,7 +137,7 @@ def refuse_consuming(name: str, storage: Storage) -> None:
     if any(isinstance(sampler, ConsumingSampler) for sampler in samplers_of(storage)):
         raise ValueError(
             f"{name} cannot work in a buffer that consumes its transitions (consume_after_n_samples, "
-            "ConsumingSampler): new ones take the places of sampled ones, in no order of time. "
+            "ConsumingSampler): new ones replace sampled ones, so the order of time is lost. "
             "Use another sampler"
         )
 
@@ -172,7 +172,7 @@ def refuse_copies_in_slices(name: str, storage: Storage, options: HindsightOptio
 
 
 def refuse_other_runs(name: str, storage: Storage, transitions: TensorDictBase, *, runs: int) -> None:
-    """Raises a ValueError if a batch, the storage or a sampler is not made for the writer's runs."""
+    """Raises a ValueError if a batch, the storage or a sampler is not for the writer's number of runs."""
     if runs == 1:
         return
     if transitions.ndim != 2 or len(transitions) % runs:

@@ -69,7 +69,7 @@ class HindsightOptions:
         redraw: True replaces a goal that the filter refuses by one that it keeps. False writes no virtual
             transition for it.
         achieved_reward: the reward of an achieved goal; with any lower reward a goal is not achieved. A
-            transition that terminated with a lower reward failed, as by a fall: it also terminates for
+            transition that terminated with a lower reward failed, such as by a fall: it also terminates for
             virtual goals, with the same reward.
         exclude: entries to leave out, in the root and under ``next``. By default ``state``, because it
             holds the real goal. Add whatever else was computed from the desired goal.
@@ -126,10 +126,10 @@ class HindsightOptions:
         if self.n_steps > 1 and self.per == "episode":
             raise ValueError(
                 f"n_steps={self.n_steps} makes single transitions, which cannot be sampled as sequences: use "
-                "per='transition', or make the n-step returns of per='episode' from the sampled sequences"
+                "per='transition', or compute n-step returns from the sequences that per='episode' samples"
             )
         if self.n_steps > 1 and (self.gamma is None or not 0 < self.gamma <= 1):
-            raise ValueError(f"n_steps={self.n_steps} needs 0 < gamma <= 1, the loss's; got {self.gamma}")
+            raise ValueError(f"n_steps={self.n_steps} needs the loss's gamma, in (0, 1], got {self.gamma}")
         if not math.isfinite(self.achieved_reward):
             raise ValueError(f"achieved_reward must be finite, got {self.achieved_reward}")
         get_strategy(self.strategy)
@@ -267,7 +267,7 @@ class HindsightBase:
             raise TypeError(f"options must be HindsightOptions or None, got {options!r}")
         self.reward_fn, self.weights = reward_fn, weights
         self.options = (options or HindsightOptions()).changed(changes)
-        self._time_seen = False  # whether an episode had several steps, or the warning was given
+        self._time_seen = False  # True once an episode had several steps or a warning was given
         self._compared = False  # whether rewards were compared with the reward function
 
     def __repr__(self) -> str:

@@ -91,7 +91,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
     drawn becomes virtual with probability k / (k + 1), which is the share that a writer with the same k
     stores. A virtual transition has another desired goal in the root and under ``next``; its reward,
     terminated and done are computed again for that goal, and everything else stays as it was, its index and
-    priority weight too. A transition whose candidates are all filtered out or of weight 0 stays real. Hand
+    priority weight too. A transition whose candidates are all filtered out or have weight 0 stays real. Pass
     the buffer both the unit and its :meth:`relabel`, as in the example.
 
     Candidates are the transitions of the same episode that are still stored. If an episode's beginning was
@@ -322,11 +322,11 @@ class HERSampleUnit(HindsightBase, SampleUnit):
     def _choose(
         self, stored: _Stored, row: Tensor, groups: Tensor, generator: torch.Generator | None
     ) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Draws which places [V] in a batch of rows [B] become virtual, and their goals [V, g].
+        """Draws which positions [V] in a batch of rows [B] become virtual, and their goals [V, g].
 
-        With metadata, also returns for each place [B] the row of its episode that achieved the goal, or -1.
+        With metadata, also returns for each row [B] the row of its episode that achieved the goal, or -1.
 
-        ``groups``, [G, L], are the places in the batch that share a goal: one place, or a slice.
+        ``groups`` [G, L] are positions in the batch that share a goal: a single one, or those of a slice.
         """
         coin = torch.rand(len(groups), device=row.device, generator=generator)
         becomes = coin < self.k / (self.k + 1)
@@ -393,7 +393,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
             refuse_consuming("HERSampleUnit", storage)
             refuse_unordered("HERSampleUnit", storage)
             refuse_shared("HERSampleUnit", storage)
-            if storage.ndim > 1:  # in flat storages, slice samplers mark copies of rows
+            if storage.ndim > 1:  # in flat ones, samplers mark the ends of slices in copies
                 refuse_slices("HERSampleUnit", storage)
             rows = storage[:]  # a view
             if not is_tensor_collection(rows):

@@ -1,4 +1,4 @@
-"""Rules for relabeling episodes that carry the stage of a curriculum in which they were played."""
+"""Rules for relabeling episodes by the stage of a curriculum that each was played in."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class StageRule(NamedTuple):
 def split_stages(
     rows: TensorDictBase, episodes: Episodes, run: Tensor | None, key: NestedKey, stages: Sequence[StageRule]
 ) -> Iterator[tuple[int, TensorDictBase, Episodes, Tensor | None]]:
-    """Yields each stage's index, transitions as it shows them, the episodes to write for it, and their runs.
+    """Yields for each stage its index, the transitions in its view, the episodes to write, and their runs.
 
     Args:
         rows: [n], transitions.
@@ -40,7 +40,7 @@ def split_stages(
         stages: rules of the stages; empty if episodes have none.
 
     Raises:
-        KeyError: rows do not carry their stage.
+        KeyError: rows lack the key of their stage.
         ValueError: an episode's stage has no rule.
     """
     if not stages:

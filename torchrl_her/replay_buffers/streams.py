@@ -119,7 +119,7 @@ def ends_of_held(streams: Tensor, order: Tensor, held: int) -> Tensor:
 
 
 def _jumps(rows: TensorDictBase, keys: TransitionKeys, last: Tensor, new: Tensor, where: Tensor) -> Tensor:
-    """Returns a mask of the pairs of neighbors ``where`` [n - 1] whose goals show that an episode ends."""
+    """Returns which pairs of successive rows, of those ``where`` [n - 1], have goals of two episodes."""
     at = where.nonzero().squeeze(-1)
     jumps = torch.zeros_like(where)
     if len(at) == 0:

@@ -63,8 +63,8 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
     The writer takes a collector's batch: [N, T] with time last, or flat with trajectory ids. Episodes that
     are still open at the end of a batch are held back until they end. A virtual transition has another
     desired goal in the root and under ``next``. Its reward, terminated and done are computed for that goal,
-    and everything else stays as it was. An episode that terminated without achieving its goal, as by a fall,
-    terminates for any goal.
+    and everything else stays as it was. An episode that terminated by a failure, such as a fall, terminates
+    for any goal.
 
     Goals come from the same episode, unless ``goal_sources`` has ``"actual"`` or ``"achieved"``. For these
     the writer remembers goals that were desired and achieved in recent episodes, in all environments of a
@@ -100,8 +100,8 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
             goals of a batch are drawn. For several runs a list, one for each run (``goal_weights``).
         runs: R, the number of independent runs.
         generators: R sources of random numbers; None for the buffer's, with one run only.
-        stages: for episodes that carry the stage of a curriculum in which they were played, one rule for each
-            stage; they take the place of ``reward_fn``. A rule may have all episodes written for its stage,
+        stages: for a curriculum in which each episode has its own stage: a list of rules, one for each
+            stage, which take the place of ``reward_fn``. A rule may have all episodes written for its stage,
             whatever stage they were played in. None if episodes have no stages.
         refill: largest number of goals of a transition, as a multiple of k. If the filter leaves some
             transitions without goals, the others get more, so that a run has about k virtual transitions for
@@ -178,7 +178,7 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
             reward_fn, options, weights=run_weights[0] if run_weights and runs == 1 else None, **changes
         )
         if refill > 1 and self.options.per == "episode":
-            raise ValueError(f"refill={refill} is for per='transition': the filter looks at each of them")
+            raise ValueError(f"refill={refill} needs per='transition', got per='episode'")
         self._weights = run_weights  # weights of goals, if they belong to several runs
         self.runs = runs
         # reward functions of runs that do not use ``reward_fn``
@@ -243,7 +243,7 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
             ValueError: the writer has ``stages``, whose rewards serve all runs.
         """
         if self.stages:
-            raise ValueError(f"run {run} has no reward of its own: episodes are relabeled by their stages")
+            raise ValueError(f"the reward of run {run} cannot be set: the rules in stages relabel all runs")
         self._own_rewards[run] = reward_fn or self.reward_fn
 
     # TorchRL's hooks
@@ -311,7 +311,7 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
             raise ValueError(f"run must be in [0, {self.runs - 1}], got {run}")
         if data.ndim != 1 or len(data) == 0 or not bool(entry_of(data, self._keys.done)[-1]):
             raise ValueError(
-                f"extend_run takes whole episodes [n], got {list(data.shape)}, the last one open or none"
+                f"extend_run needs transitions [n], the last of which is done, got {list(data.shape)}"
             )
         self._check(data if self.runs == 1 else data.unsqueeze(0).expand(self.runs, len(data)))
         batch = Batch.of(data, self._keys, runs=1)
@@ -348,13 +348,13 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
         continue them.
         """
         if len(state_dict["cursors"]) != self.runs:
-            raise ValueError(f"the state is of {len(state_dict['cursors'])} runs, not of {self.runs}")
+            raise ValueError(f"the state must have {self.runs} runs, got {len(state_dict['cursors'])}")
         super().load_state_dict(state_dict)
         self._rings.cursors, self._rings.sizes = list(state_dict["cursors"]), list(state_dict["sizes"])
         self._held = Batch.from_state(state_dict, runs=self.runs)
         recent = state_dict["recent"]
         if len(recent) != max(1, len(self.stages)):
-            raise ValueError(f"the state is of {len(recent)} stages, not of {max(1, len(self.stages))}")
+            raise ValueError(f"the state must have {max(1, len(self.stages))} stages, got {len(recent)}")
         self._recent = [RecentGoals.from_state(saved) for saved in recent]
         self._episodes, self._all_over = state_dict["episodes"], state_dict["all_over"]
         self._loaded = True
@@ -479,7 +479,7 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
     def _commit(self, drafts: list[_Draft], places: Places) -> None:
         """Stores and counts real and virtual transitions, and notes where the real ones went.
 
-        If a batch does not fit into the buffer, the virtual ones in front are the first to be pushed out. A
+        If a batch does not fit into the buffer, virtual ones, which are written first, are overwritten. A
         user's functions are called first: if one raises an error, nothing of the batch is stored or counted.
         """
         exclude = [*self._exclude, *in_root_and_next([self._keys.env_ids])]

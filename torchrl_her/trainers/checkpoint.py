@@ -275,7 +275,7 @@ def _capacity(buffer: TensorDictReplayBuffer) -> int:
 
 
 def _alone(rows: Tensor) -> Tensor:
-    """Returns rows, uncopied, as a tensor whose storage has no others, since torch.save writes storages."""
+    """Returns a view of rows whose storage has no other rows, since torch.save writes whole storages."""
     if not rows.is_contiguous():
         return rows.clone()
     start = rows.storage_offset() * rows.itemsize
@@ -297,10 +297,10 @@ def load_buffer_state_dict(buffer: TensorDictReplayBuffer, state: dict[str, Any]
     if any(sizes_of(buffer)):
         raise ValueError(f"the buffer must be empty, it holds {sum(sizes_of(buffer)):,} rows")
     if capacity != state["capacity"]:
-        raise ValueError(f"the state is of a buffer of {state['capacity']:,} rows, not of {capacity:,}")
+        raise ValueError(f"the state must have a capacity of {capacity:,} rows, got {state['capacity']:,}")
     load_sampler_state_dict(buffer.sampler, state["sampler"])
     if len(state["blocks"]) != runs_of(buffer):
-        raise ValueError(f"the state is of {len(state['blocks'])} runs, not of {runs_of(buffer)}")
+        raise ValueError(f"the state must have {runs_of(buffer)} runs, got {len(state['blocks'])}")
     for (begin, end), block in zip(state["blocks"], state["rows"], strict=True):
         if block is not None:
             _load_block(buffer.storage, begin, end, block)
@@ -332,7 +332,7 @@ def sampler_state_dict(sampler: Sampler, size: int) -> dict[str, Any]:
     For a prioritized sampler it holds the priorities of the first ``size`` rows only, which are filled.
     """
     if isinstance(sampler, SamplerEnsemble):
-        # The members' trees are saved whole, since the number of filled rows of each is not known here.
+        # The trees of an ensemble are saved whole, since the numbers of filled rows are not known here.
         state: dict[str, Any] = {
             str(i): sampler_state_dict(part, capacity_of(part)) for i, part in enumerate(samplers_in(sampler))
         }
@@ -354,7 +354,7 @@ def load_sampler_state_dict(sampler: Sampler, state: dict[str, Any]) -> None:
     """
     kind = type(sampler).__name__
     if state["kind"] != kind:
-        raise ValueError(f"the state is of a {state['kind']}, not of a {kind}")
+        raise ValueError(f"the state must be of a {kind}, got a {state['kind']}")
     if isinstance(sampler, SamplerEnsemble):
         for i, part in enumerate(samplers_in(sampler)):
             load_sampler_state_dict(part, state["own"][str(i)])

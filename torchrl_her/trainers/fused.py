@@ -113,7 +113,7 @@ class FusedLearner:
         """Makes gradient steps for each run; see :class:`~torchrl_her.trainers.Learner`.
 
         Raises:
-            ValueError: the rows are not of R runs, not a whole number of batches, not on the CPU, carry
+            ValueError: the rows are not of R runs, not a whole number of batches, not on the CPU, have
                 a mask of TorchRL's losses or do not match the networks; a batch of one row is to be
                 normalized; or the loss or its optimizer has changed to one that is not supported.
         """

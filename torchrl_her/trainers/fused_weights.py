@@ -62,7 +62,7 @@ class FusedWeights:
         self._table: Any = None
 
     def table(self) -> Any:
-        """Returns the addresses of all tensors, updated if tensors were replaced, as by loading a checkpoint.
+        """Returns the addresses of all tensors, updated if loading a checkpoint has replaced some.
 
         Raises:
             ValueError: tensors do not fit each other, are not contiguous, not on the CPU or of another type

@@ -114,7 +114,7 @@ _NORMS = {StackedLayerNorm: Norm.LAYERNORM, StackedBatchNorm: Norm.BATCHNORM}
 
 
 def why_not_fused(loss: nn.Module, target: TargetNetUpdater | None) -> str | None:
-    """Returns what :class:`~torchrl_her.FusedLearner` would get wrong, for messages; None if nothing.
+    """Returns the reason why :class:`~torchrl_her.FusedLearner` cannot train a loss; None if it can.
 
     Args:
         loss: any loss module.
@@ -280,7 +280,7 @@ def _strange_networks(loss: LossModule, fused: FusedLoss) -> Iterator[str]:
 
 
 def _is_plain_module(actor: nn.Module, fused: FusedLoss) -> bool:
-    """Returns whether an actor is a network, followed for SAC, TQC and DQN by their usual last module."""
+    """Returns whether an actor is a network alone or, in SAC, TQC and DQN, with the usual last module."""
     if fused.algorithm not in (*STOCHASTIC, Algorithm.DQN):
         return type(actor) is TensorDictModule
     if (

@@ -39,7 +39,7 @@ def check_rows(rows: TensorDictBase, steps: int, runs: int) -> None:
     if rows.ndim not in (1, 2) or (rows.shape[0] if rows.ndim == 2 else 1) != runs:
         raise ValueError(f"rows of {runs} runs must be of shape [{runs}, n], got {list(rows.shape)}")
     if steps < 1 or rows.shape[-1] % steps:
-        raise ValueError(f"{rows.shape[-1]} rows cannot be shared out among {steps} gradient steps")
+        raise ValueError(f"steps must be at least 1 and divide {rows.shape[-1]} rows, got {steps}")
 
 
 def check_idle(
@@ -58,7 +58,7 @@ def check_idle(
         if idle and type(part) in remedies:
             raise ValueError(
                 f"runs {list(idle)} are idle, but {type(part).__name__} counts the steps of all runs "
-                f"together: take torchrl_her.{remedies[type(part)]}"
+                f"together: use torchrl_her.{remedies[type(part)]}"
             )
 
 

@@ -212,13 +212,13 @@ class Trainer:
             batch = self.collector.next()
             _check_batch(batch)
             if ("collector", "traj_ids") not in batch.keys(True):
-                raise ValueError("the collector must mark trajectories: episodes are cut where epochs begin")
+                raise ValueError("batches need ('collector', 'traj_ids'), to truncate open episodes")
             collected = batch.numel() // self.runs  # frames of one run
             is_last = self.frames + collected >= end
             if not is_last and isinstance(self.collector, CollectsAhead):
                 self.collector.collect_ahead()
             if len(batch) % self.runs:
-                raise ValueError(f"{len(batch)} environments cannot be shared out among {self.runs} runs")
+                raise ValueError(f"a batch must have a multiple of runs={self.runs} rows, got {len(batch)}")
             self.buffer.extend(cut_episodes(batch) if cut and is_last else batch)
             self.frames += collected
             self._credit += collected / self.frames_per_update

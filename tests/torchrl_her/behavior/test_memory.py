@@ -70,7 +70,7 @@ def test_an_empty_state_is_one_too() -> None:
 
 
 def test_another_state_is_refused() -> None:
-    with pytest.raises(ValueError, match="2 runs with 3 goals each, got one of 1 runs with 3"):
+    with pytest.raises(ValueError, match="2 runs with 3 goals each, got 1 runs with 3"):
         AchievedGoals(3, runs=2).load_state_dict(AchievedGoals(3).state_dict())
 
 
@@ -83,7 +83,7 @@ def test_bad_options() -> None:
 
 def test_bad_goals() -> None:
     memory = AchievedGoals(1, runs=2)
-    with pytest.raises(ValueError, match="3 goals cannot be shared out among 2 runs"):
+    with pytest.raises(ValueError, match="number of goals must be a multiple of runs=2, got 3"):
         memory.add(goals(1, 2, 3), goals(1, 2, 3))
     with pytest.raises(ValueError, match="2 goals of each run do not fit into a memory of 1"):
         memory.add(goals(1, 2, 3, 4), goals(1, 2, 3, 4))

@@ -298,7 +298,7 @@ def test_it_goes_on_from_a_collectors_state() -> None:
 def test_other_parts_have_another_state() -> None:
     _, behavior = made(weights=Told(3.0))
     _, other = made()
-    with pytest.raises(ValueError, match="the state has 1 weights, not 0"):
+    with pytest.raises(ValueError, match="the state must have 0 weights, got 1"):
         other.load_state_dict(behavior.state_dict())
 
 
@@ -341,7 +341,7 @@ def test_bad_options() -> None:
         BehaviorGoals(REWARD, candidates=0)
     with pytest.raises(ValueError, match="update_on must be one of achieved, proposed, got 'nothing'"):
         BehaviorGoals(REWARD, update_on="nothing")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="2 runs need a list of 2 weights, one of each run, got 1"):
+    with pytest.raises(ValueError, match="2 runs need a list of 2 weights, one for each run, got 1"):
         BehaviorGoals(REWARD, runs=2, weights=Told(1.0), generators=[torch.Generator()] * 2)
 
 
@@ -352,7 +352,7 @@ def test_missing_entries() -> None:
 
 def test_environments_that_cannot_be_shared_out() -> None:
     env, _ = made(3, runs=2)
-    with pytest.raises(ValueError, match="3 environments cannot be shared out among 2 runs"):
+    with pytest.raises(ValueError, match="a batch must have a multiple of runs=2 environments, got 3"):
         env.reset()
 
 

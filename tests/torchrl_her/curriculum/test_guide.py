@@ -117,7 +117,7 @@ def test_runs_are_guided_by_what_they_have_learned_themselves() -> None:
     assert acts(guide, [[3.0, 5.0, 7.0]] * 6) == [-1.0] * 4 + [7.0 * 53.0] * 2
     guide.follow(policy(5.0, 6.0, 7.0), 0, run=0)
     assert acts(guide, [[3.0, 5.0, 7.0]] * 6) == [5.0 * 53.0] * 2 + [-1.0] * 2 + [7.0 * 53.0] * 2
-    with pytest.raises(ValueError, match="4 rows cannot be shared out among 3 runs"):
+    with pytest.raises(ValueError, match="number of rows must be a multiple of runs=3, got 4"):
         acts(guide, [[3.0, 5.0, 7.0]] * 4)
 
 

@@ -95,16 +95,16 @@ def test_a_stage_keeps_what_it_is_given() -> None:
         ({"threshold": math.inf}, r"got inf"),
         ({"observation": []}, r"stage 'one': observation must not be empty"),
         ({"desired_goal": [-1]}, r"stage 'one': desired_goal must have indices of at least 0, got \(-1,\)"),
-        ({"observation": [0, 1, 0]}, r"stage 'one': observation must have each index once, got \(0, 1, 0\)"),
+        ({"observation": [0, 1, 0]}, r"stage 'one': observation must not repeat an index, got \(0, 1, 0\)"),
         ({"desired_goal": [1]}, r"stage 'one': desired_goal must share no index with observation, got \[1\]"),
         (
             {"observation": [1], "desired_goal": [0]},
             r"stage 'one': desired_goal must share no index with achieved_goal, got \[0\]",
         ),
-        ({"desired_goal": [2, 3]}, r"stage 'one': .* of one width, got \(0,\) and \(2, 3\)"),
+        ({"desired_goal": [2, 3]}, r"stage 'one': .* the same width, got \(0,\) and \(2, 3\)"),
         ({"constant_goal": [0.5]}, r"stage 'one': give desired_goal or constant_goal, got both"),
         ({"desired_goal": [], "constant_goal": [math.nan]}, r"constant_goal must be finite, got \(nan,\)"),
-        ({"desired_goal": [], "constant_goal": [1.0, 2.0]}, r"of one width, got \(0,\) and \(1.0, 2.0\)"),
+        ({"desired_goal": [], "constant_goal": [1.0, 2.0]}, r"the same width, got \(0,\) and \(1.0, 2.0\)"),
         ({"desired_goal": []}, r"stage 'one': desired_goal must not be empty"),
     ],
 )
@@ -166,8 +166,8 @@ def test_indices_must_be_whole_numbers() -> None:
         ([make_stage("a", observation="arm")], r"stage 'a': .* unknown name 'arm'; known are 'hand', 'hole'"),
         # What a stage of names hides until the names are resolved
         ([make_stage("a", desired_goal="hand")], r"stage 'a': .* share no index with observation, got \[0\]"),
-        ([make_stage("a", observation=["hand", 0])], r"stage 'a': .* each index once, got \(0, 0\)"),
-        ([make_stage("a", desired_goal="hole")], r"stage 'a': .* of one width, got \(0,\) and \(2, 3\)"),
+        ([make_stage("a", observation=["hand", 0])], r"stage 'a': .* not repeat an index, got \(0, 0\)"),
+        ([make_stage("a", desired_goal="hole")], r"stage 'a': .* the same width, got \(0,\) and \(2, 3\)"),
     ],
 )
 def test_bad_curricula_are_named(stages: list[CurriculumStage], message: str) -> None:
@@ -291,12 +291,12 @@ def test_state_is_not_shared() -> None:
 
 
 def test_a_state_that_does_not_fit_is_refused() -> None:
-    with pytest.raises(ValueError, match="the state is of 2 runs, but there are 1"):
+    with pytest.raises(ValueError, match="the state must have 1 runs, got 2"):
         make_progress().load_state_dict(make_progress(runs=2).state_dict())
     deep = make_progress()
     deep.set_stage(0, 2)
     shallow = CurriculumProgress(Curriculum([make_stage()], 3))
-    with pytest.raises(ValueError, match=r"stages are \(2,\), but there are 1 stages"):
+    with pytest.raises(ValueError, match=r"stages in the state must be in \[0, 0\], got \(2,\)"):
         shallow.load_state_dict(deep.state_dict())
 
 

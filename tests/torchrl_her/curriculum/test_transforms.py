@@ -565,7 +565,7 @@ def test_missing_entries_are_named() -> None:
 def test_parts_that_do_not_belong_together_are_refused() -> None:
     progress = at(make_three(), 0, 0)
     for transform in (StateToObs, ZeroPad):
-        with pytest.raises(ValueError, match="progress must be made of the same curriculum"):
+        with pytest.raises(ValueError, match="progress must have the same curriculum object"):
             transform(make_three(), progress)
     for run in (-1, 2):
         with pytest.raises(ValueError, match=rf"run must be None or in \[0, 1\], got {run}"):

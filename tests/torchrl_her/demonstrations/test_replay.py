@@ -78,7 +78,7 @@ def test_how_many_rows_of_a_batch_are_demonstrations(share: float, batch_size: i
     [
         (0.0, 8, r"share must be in \(0, 1\), got 0.0"),
         (1.0, 8, r"share must be in \(0, 1\), got 1.0"),
-        (0.5, 1, "batch_size must be at least 2 for batches of two kinds, got 1"),
+        (0.5, 1, "batch_size must be at least 2 to mix two kinds of rows, got 1"),
     ],
 )
 def test_shares_that_leave_no_room(share: float, batch_size: int, message: str) -> None:
@@ -191,9 +191,9 @@ def test_it_shows_the_size_and_the_writer_of_the_own_buffer() -> None:
 
 
 def test_what_is_no_whole_number_of_batches_is_refused() -> None:
-    with pytest.raises(ValueError, match="12 rows are no whole number of batches of 8 for 1 runs"):
+    with pytest.raises(ValueError, match="batch_size must be a positive multiple of 8, got 12"):
         mixed().sample(12)
-    with pytest.raises(ValueError, match="0 rows are no whole number of batches"):
+    with pytest.raises(ValueError, match="batch_size must be a positive multiple of 8, got 0"):
         mixed().sample(0)
 
 

@@ -206,7 +206,7 @@ def test_it_goes_on_from_its_state(tmp_path: Any) -> None:
     [
         (SHOWN, {"share": 1.5}, r"share must be in \[0, 1\], got 1.5"),
         (SHOWN, {"width": 0}, "width must be at least 1, got 0"),
-        ([SHOWN], {"runs": 2}, "2 runs need demonstrations and a generator for each, got 1"),
+        ([SHOWN], {"runs": 2}, "2 runs need 2 demonstrations and generators, got 1"),
         (walks(3, states=False), {}, "demonstrations of walk hold no physical states that episodes could"),
         (walks(3, 4, goal=77.0), {}, "none of 2 demonstrations of walk achieves its goal"),
     ],
@@ -229,5 +229,5 @@ def test_an_environment_that_cannot_start_anywhere_is_refused_by_name() -> None:
 
 def test_environments_that_cannot_be_shared_out_are_refused() -> None:
     starts = DemonstrationStarts([SHOWN] * 3, runs=3)
-    with pytest.raises(ValueError, match="4 environments cannot be shared out among 3 runs"):
+    with pytest.raises(ValueError, match="a batch must have a multiple of runs=3 environments, got 4"):
         TransformedEnv(make_env("hand_v1", num_envs=4, seed=0), starts).reset()

@@ -69,7 +69,7 @@ def test_its_state() -> None:
         own.record(0, [False])
         assert own.back == [6, 6]
         assert own.state_dict() == walk.state_dict()
-    with pytest.raises(ValueError, match="the state is of 2 runs, not of 1"):
+    with pytest.raises(ValueError, match="the state must have 1 runs, got 2"):
         WalkBack([9]).load_state_dict(walk.state_dict())
 
 

@@ -164,7 +164,7 @@ def test_weights_are_finite_and_only_goals_that_are_not_have_none(
 def test_goals_of_another_width_are_refused() -> None:
     weights = RareGoals()
     weights.update(random(5, 2))
-    with pytest.raises(ValueError, match="goals of 2 numbers are remembered, got goals of 3"):
+    with pytest.raises(ValueError, match="goals must have 2 numbers, as earlier ones, got 3"):
         weights.update(random(5, 3))
     weights.clear()
     weights.update(random(5, 3))
@@ -203,7 +203,7 @@ def test_it_goes_on_as_it_was_saved(estimator: Any, tmp_path: Any) -> None:
         assert torch.equal(second(asked), first(asked))
         for weights in (first, second):
             weights.update(random(17, 2, seed=seed))
-    with pytest.raises(ValueError, match="memory=10 goals fit, the state has 50"):
+    with pytest.raises(ValueError, match="the state must have at most memory=10 goals, got 50"):
         RareGoals(memory=10).load_state_dict(first.state_dict())
 
 

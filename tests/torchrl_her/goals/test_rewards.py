@@ -117,10 +117,10 @@ def test_whole_numbers_do_not_wrap_around(dtype: torch.dtype) -> None:
 @pytest.mark.parametrize(
     ("function", "got"),
     [
-        (lambda a, d: -(a - d).abs(), "Tensor; a function of rewards alone comes as EnvReward"),
-        (lambda a, d: -(a - d).abs().numpy(), "ndarray; a function"),
-        (lambda a, d: (-(a - d).abs(), True), "Tensor and bool; a function"),
-        (lambda a, d: (a, a, a), "Tensor and Tensor and Tensor; a function"),
+        (lambda a, d: -(a - d).abs(), "Tensor; wrap a function that returns only rewards as EnvReward"),
+        (lambda a, d: -(a - d).abs().numpy(), "ndarray; wrap"),
+        (lambda a, d: (-(a - d).abs(), True), "Tensor and bool; wrap"),
+        (lambda a, d: (a, a, a), "Tensor and Tensor and Tensor; wrap"),
         (lambda rows: rows, "takes 1 positional argument but 2 were given"),
         (lambda a, d, info: a, "missing 1 required positional argument: 'info'"),
     ],

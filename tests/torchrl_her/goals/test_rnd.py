@@ -108,7 +108,7 @@ def test_it_learns_where_gradients_are_off() -> None:
 
 def test_emptying_starts_again_and_takes_goals_of_any_width() -> None:
     weights, fresh = taught(NetworkNovelty(), uniform(50), 5), NetworkNovelty()
-    with pytest.raises(ValueError, match="goals of 2 numbers were learned, got goals of 3"):
+    with pytest.raises(ValueError, match="goals must have 2 numbers, as earlier ones, got 3"):
         weights.update(uniform(5, 3))
     weights.clear()
     assert weights(uniform(3)).tolist() == [1.0] * 3

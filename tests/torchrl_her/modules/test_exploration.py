@@ -245,7 +245,7 @@ def test_epsilon_cannot_start_outside_of_0_to_1(start: float) -> None:
 
 def test_rows_must_be_equal_blocks() -> None:
     exploration = DecayingEpsilonGreedy(2, generators=[torch.Generator() for _ in range(2)])
-    with pytest.raises(ValueError, match="5 rows cannot be shared out among 2 runs"):
+    with pytest.raises(ValueError, match="number of rows must be a multiple of runs=2, got 5"):
         exploration(TensorDict({"action": torch.zeros(5, dtype=torch.int64)}, [5]))
 
 

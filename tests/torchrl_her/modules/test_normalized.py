@@ -289,14 +289,14 @@ def test_a_copied_policy_keeps_its_statistics() -> None:
 
 def test_policies_that_cannot_be() -> None:
     actor = make_actor((2, 2), 3, in_keys=("position", "target"))
-    with pytest.raises(ValueError, match=r"reads \['position', 'target'\], of which none is normalized"):
+    with pytest.raises(ValueError, match=r"must read a normalized entry, .* got \['position', 'target'\]"):
         NormalizedPolicy(actor, make_norm())
 
     def same(observation: torch.Tensor) -> torch.Tensor:
         return observation
 
     writes = TensorDictModule(same, in_keys=["observation"], out_keys=["observation"])
-    with pytest.raises(ValueError, match=r"must not write what is normalized, got \['observation'\]"):
+    with pytest.raises(ValueError, match=r"must not write normalized entries, got \['observation'\]"):
         NormalizedPolicy(writes, make_norm())
 
 

@@ -127,9 +127,7 @@ def test_what_cannot_be_is_named(options: dict[str, Any], message: str) -> None:
 def test_targets_of_some_critics_are_refused() -> None:
     actor = make_stochastic_actor((4, 2), SPEC)
     critic = make_critic((4, 2), 3, outputs=3)
-    with pytest.raises(
-        TypeError, match=r"TQC's targets have the quantiles of all critics.* target_critics=1"
-    ):
+    with pytest.raises(TypeError, match=r"TQC's targets use the quantiles of all critics.* target_critics=1"):
         PenalizedTQCLoss(actor, critic, action_spec=SPEC, num_qvalue_nets=2, target_critics=1)
 
 

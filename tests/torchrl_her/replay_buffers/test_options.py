@@ -190,7 +190,7 @@ def test_a_k_that_was_given_is_refused_beside_sources_even_if_it_is_the_default(
         ({"actual": 0}, ValueError, "whole numbers of at least 1, got 0 for 'actual'"),
         ({"actual": True}, ValueError, "got True for 'actual'"),
         ({"future": 1.5}, ValueError, "got 1.5 for 'future'"),
-        ("actual", TypeError, r"must be numbers by source, as in \{'future': 4\}, got 'actual'"),
+        ("actual", TypeError, r"must map sources to numbers, as in \{'future': 4\}, got 'actual'"),
     ],
 )
 def test_sources_that_cannot_be_are_named(sources: Any, error: type[Exception], message: str) -> None:

@@ -254,7 +254,7 @@ def test_rows_of_several_stages_are_refused_where_one_reward_relabels_them(
     make: Callable[..., TensorDictReplayBuffer],
 ) -> None:
     batch = make_batch([[3], [3]]).set("stage", torch.zeros(2, 3, 1, dtype=torch.int64))
-    with pytest.raises(ValueError, match=r"carry their stage \('stage'\).* HERWriter\(stages=\[...\]\)"):
+    with pytest.raises(ValueError, match=r"with a stage \('stage'\).* HERWriter\(stages=\[...\]\)"):
         fill(make(), batch)
     fill(make(stage_key="floor"), batch)
     writing(k=0).extend(batch)

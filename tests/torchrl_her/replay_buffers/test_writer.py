@@ -99,7 +99,7 @@ def test_goals_are_made_up_for_where_nothing_was_kept_so_far() -> None:
 
 
 def test_refill_is_for_single_transitions() -> None:
-    with pytest.raises(ValueError, match="refill=2 is for per='transition'"):
+    with pytest.raises(ValueError, match="refill=2 needs per='transition', got per='episode'"):
         HERWriter(REWARD, per="episode", refill=2)
     with pytest.raises(ValueError, match="refill must be"):
         HERWriter(REWARD, refill=0)
@@ -501,7 +501,7 @@ def test_ids_that_are_used_again_join_no_episodes() -> None:
 def test_batches_in_another_form_are_refused_while_episodes_are_open() -> None:
     buffer = make_buffer()
     buffer.extend(make_batch([[9]], steps=3))
-    with pytest.raises(ValueError, match="by places in the batch, this batch by trajectory ids"):
+    with pytest.raises(ValueError, match="by places in the batch, but this batch has trajectory ids"):
         buffer.extend(make_batch([[9]], first=[(0, 3)], steps=3).squeeze(0))
 
 

@@ -403,9 +403,9 @@ def test_rows_of_two_dimensions_go_on(sampler: str, tmp_path: Path) -> None:
     ("sampler", "capacity", "full", "message"),
     [
         ("uniform", 64, True, "the buffer must be empty, it holds 15 rows"),
-        ("uniform", 65, False, "the state is of a buffer of 64 rows, not of 65"),
-        ("in order", 64, False, "the state is of a RandomSampler, not of a SamplerWithoutReplacement"),
-        ("prioritized", 64, False, "the state is of a RandomSampler, not of a PrioritizedSampler"),
+        ("uniform", 65, False, "the state must have a capacity of 65 rows, got 64"),
+        ("in order", 64, False, "the state must be of a SamplerWithoutReplacement, got a RandomSampler"),
+        ("prioritized", 64, False, "the state must be of a PrioritizedSampler, got a RandomSampler"),
     ],
 )
 def test_buffers_of_another_make_are_refused(sampler: str, capacity: int, full: bool, message: str) -> None:

@@ -257,12 +257,12 @@ def test_a_run_that_was_idle_learns_as_with_torchrl_s_loss(algorithm: str, hard:
 def test_idle_runs_need_counts_of_their_own() -> None:
     rows = make_rows("ddpg", (2, 8))
     learner = make_learner(FusedLearner, make_loss("ddpg", runs=2))
-    with pytest.raises(ValueError, match=r"runs \[1\] are idle, but Adam counts .* take .*RunsAdam"):
+    with pytest.raises(ValueError, match=r"runs \[1\] are idle, but Adam counts .* use .*RunsAdam"):
         learner.update(rows, idle=[1])
     loss = make_loss("ddpg", runs=2)
     target = HardUpdate(loss, value_network_update_interval=3)
     learner = LossLearner(loss, RunsAdam(loss, runs=2), target, runs=2)
-    with pytest.raises(ValueError, match=r"HardUpdate counts .* take .*make_target_updater"):
+    with pytest.raises(ValueError, match=r"HardUpdate counts .* use .*make_target_updater"):
         learner.update(rows, idle=[1])
 
 

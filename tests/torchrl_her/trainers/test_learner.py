@@ -175,5 +175,5 @@ def test_rows_must_be_whole_batches(fused: bool, steps: int) -> None:
     loss = make_ddpg_loss(make_actor((2, 2), 1), make_critic((2, 2), 1))
     make = FusedLearner if fused else LossLearner
     learner = make(loss, torch.optim.Adam(loss.parameters()), SoftUpdate(loss, tau=0.1))
-    with pytest.raises(ValueError, match=f"10 rows cannot be shared out among {steps} gradient steps"):
+    with pytest.raises(ValueError, match=f"steps must be at least 1 and divide 10 rows, got {steps}"):
         learner.update(make_batch([[10]]), steps)

@@ -315,7 +315,7 @@ def test_numbers_that_cannot_be(options: dict[str, Any], message: str) -> None:
 def test_environments_must_be_equal_blocks() -> None:
     trainer, _ = make_trainer()
     trainer.runs = 3
-    with pytest.raises(ValueError, match=f"{N} environments cannot be shared out among 3 runs"):
+    with pytest.raises(ValueError, match=f"a batch must have a multiple of runs=3 rows, got {N}"):
         trainer.epoch()
 
 
@@ -330,7 +330,7 @@ def test_trajectories_must_be_marked(monkeypatch: pytest.MonkeyPatch) -> None:
     trainer, _ = make_trainer()
     collect = trainer.collector.next
     monkeypatch.setattr(trainer.collector, "next", lambda: collect().exclude(("collector", "traj_ids")))
-    with pytest.raises(ValueError, match="must mark trajectories"):
+    with pytest.raises(ValueError, match=r"batches need \('collector', 'traj_ids'\)"):
         trainer.epoch()
 
 

@@ -1,4 +1,4 @@
-"""Transitions of a batch, or those held back from earlier batches, with their runs and environments."""
+"""Transitions of a batch, or held back from earlier ones, with the run and environment of each."""
 
 from __future__ import annotations
 
@@ -69,8 +69,8 @@ class Batch:
             return self
         if self.kind != held.kind:
             raise ValueError(
-                f"episodes that are still open were told apart by {held.kind}, this batch by {self.kind}: "
-                "hand over all batches in one form, [N, T] or flat, and with the same ids"
+                f"open episodes were distinguished by {held.kind}, but this batch has {self.kind}: write all "
+                "batches in one form, [N, T] or flat, and with the same kind of ids"
             )
         place = self.ids.device  # rows that are held back may come from a checkpoint
         run = None if held.run is None or self.run is None else torch.cat((held.run.to(place), self.run))

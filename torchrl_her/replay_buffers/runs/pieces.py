@@ -50,7 +50,7 @@ class Piece(NamedTuple):
 
 @dataclass(frozen=True)
 class Chunk:
-    """Episodes that are relabeled and written together.
+    """Episodes of a piece, with the transitions, reward function and options to relabel them.
 
     Attributes:
         rows: [n], collected transitions, with other episodes among them.
@@ -142,7 +142,7 @@ def _join(episodes: Episodes, shares: list[_Share]) -> Piece:
     """Joins episodes of different runs to a piece."""
     horizon = max(share.horizon for share in shares)
     first, last = shares[0], shares[-1]
-    if last.begin + last.number - first.begin == sum(share.number for share in shares):  # shares without gaps
+    if last.begin + last.number - first.begin == sum(share.number for share in shares):  # without gaps
         span = slice(first.begin, last.begin + last.number)
         rows, lengths = episodes.rows[span], episodes.lengths[span]
     else:

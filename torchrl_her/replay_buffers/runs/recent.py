@@ -112,7 +112,7 @@ class RecentGoals:
 
 
 def _last(before: Tensor | None, new: Tensor, size: int) -> Tensor | None:
-    """Returns the last ``size`` of old and new goals [m, g]; if the new ones are more, an even sample."""
+    """Returns the newest ``size`` goals [m, g]; if even the new ones are more, an evenly spread part."""
     if len(new) == 0:
         return before
     if len(new) > size:

@@ -96,7 +96,7 @@ class Places:
         Args:
             runs: indices of m runs.
             last: m tensors [c] int64, for each of these runs the positions in the batch of the rows that were
-                written last, in that order. Rows before them are copies, whose places are not needed.
+                written last, in that order. Rows written before these are virtual, and not looked up.
             counts: number of all rows that were written for each of these runs.
         """
         for run, positions, count in zip(runs, last, counts, strict=True):

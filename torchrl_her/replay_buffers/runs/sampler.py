@@ -72,7 +72,7 @@ class _BlockSampler(StateFile, Sampler):
 
     def _check_state(self, state_dict: dict[str, Any]) -> None:
         if len(state_dict["sizes"]) != self.runs:
-            raise ValueError(f"the state is of {len(state_dict['sizes'])} runs, not of {self.runs}")
+            raise ValueError(f"the state must have {self.runs} runs, got {len(state_dict['sizes'])}")
 
 
 class RunsSampler(_BlockSampler):

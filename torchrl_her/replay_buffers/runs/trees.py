@@ -142,14 +142,14 @@ class SumTrees:
 
 
 def _total(children: Tensor) -> Tensor:
-    """Returns the sums [n] over children [n, 16], as running sums, so that they round as draws do."""
+    """Returns the sums [n] over children [n, 16], rounded like the running sums that draws use."""
     return children.cumsum(-1)[:, -1]
 
 
 def _descend(sums: Tensor, mass: Tensor) -> tuple[Tensor, Tensor]:
-    """Returns the children [..., 1] in which masses [..., 1] lie, and the rest of each mass.
+    """Returns the child [..., 1] that each draw goes down to, and the mass left for it within that child.
 
-    The running sums of the children are [..., c]. A child of value 0 is never taken, unless all are 0.
+    It is the first child whose running sum [..., c] is above the mass; never one of 0, unless all are 0.
     """
     total = sums[..., -1:]  # may be less than the mass because of rounding
     within = torch.minimum(mass.to(sums.dtype), torch.nextafter(total, torch.zeros_like(total)))

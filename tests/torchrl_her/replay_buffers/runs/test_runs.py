@@ -333,15 +333,15 @@ def test_a_state_goes_on_as_the_unbroken_buffer(sampler: str, packed: bool) -> N
     assert other.writer.totals == buffer.writer.totals
     with pytest.raises(ValueError, match="the buffer must be empty"):
         load_buffer_state_dict(other, state)
-    with pytest.raises(ValueError, match="the state is of"):
+    with pytest.raises(ValueError, match="the state must have . runs, got"):
         load_buffer_state_dict(make_buffer(range(2), capacity=60, sampler=sampler, packed=packed), state)
 
 
 def test_what_cannot_be_is_refused() -> None:
     generators = [torch.Generator() for _ in range(RUNS)]
-    with pytest.raises(ValueError, match="3 runs need 3 generators, one of each run, got None"):
+    with pytest.raises(ValueError, match="3 runs need 3 generators, one for each run, got None"):
         HERWriter(NEAR, runs=RUNS)
-    with pytest.raises(ValueError, match="3 runs need a list of 3 weights, one of each run, got 1"):
+    with pytest.raises(ValueError, match="3 runs need a list of 3 weights, one for each run, got 1"):
         HERWriter(NEAR, runs=RUNS, generators=generators, weights=GoalHistogram(GRID))
     together, batch = make_buffer(range(RUNS)), make_batch([[2]] * (RUNS * ENVS))
     with pytest.raises(ValueError, match=r"takes batches \[R \* N, T\], 3 equal blocks .*, got \[5, 2\]"):
@@ -398,8 +398,8 @@ def test_open_episodes_wait_while_others_are_written() -> None:
     ("steps", "run", "message"),
     [
         (3, 3, r"run must be in \[0, 2\], got 3"),
-        (2, 0, r"extend_run takes whole episodes \[n\], got \[2\], the last one open"),
-        (0, 0, r"extend_run takes whole episodes \[n\], got \[0\]"),
+        (2, 0, r"extend_run needs transitions \[n\], the last of which is done, got \[2\]"),
+        (0, 0, r"extend_run needs transitions \[n\], the last of which is done, got \[0\]"),
     ],
 )
 def test_what_is_no_whole_episode_of_a_run_is_refused(steps: int, run: int, message: str) -> None:

@@ -166,7 +166,7 @@ def test_a_file_brings_the_same_draws_back(kind: str, tmp_path: Path) -> None:
     again, info_again = other.sample(storage(), 3 * 16)
     assert torch.equal(index, again)
     assert all(torch.equal(info[key], info_again[key]) for key in info)
-    with pytest.raises(ValueError, match="the state is of 3 runs, not of 2"):
+    with pytest.raises(ValueError, match="the state must have 2 runs, got 3"):
         make(kind, 2).load_state_dict(sampler.state_dict())
 
 
@@ -174,9 +174,9 @@ def test_a_file_brings_the_same_draws_back(kind: str, tmp_path: Path) -> None:
 def test_what_cannot_be_is_refused(kind: str) -> None:
     with pytest.raises(ValueError, match="runs must be at least 1, got 0"):
         make(kind, 0, generators=None)
-    with pytest.raises(ValueError, match="3 runs need 3 generators, one of each run, got None"):
+    with pytest.raises(ValueError, match="3 runs need 3 generators, one for each run, got None"):
         make(kind, generators=None)
-    with pytest.raises(ValueError, match="3 runs need 3 generators, one of each run, got 2"):
+    with pytest.raises(ValueError, match="3 runs need 3 generators, one for each run, got 2"):
         make(kind, generators=generators(2))
     sampler = make(kind)
     with pytest.raises(RuntimeError, match="an empty buffer cannot be sampled from"):
