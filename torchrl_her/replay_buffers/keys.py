@@ -181,7 +181,7 @@ def stored_as(value: Tensor, entry: Tensor, key: NestedKey) -> Tensor:
         tensor([[4]])
         >>> stored_as(torch.tensor([4.4]), torch.zeros(3, 1, dtype=torch.int64), "desired_goal")
         Traceback (most recent call last):
-        ValueError: 'desired_goal' is of torch.int64, which cannot hold 4.4...: collect torch.float32
+        ValueError: 'desired_goal' is of torch.int64, which cannot hold 4.4...: use torch.float32
     """
     out = value.to(entry.dtype)
     if out.dtype != value.dtype and not out.is_floating_point():
