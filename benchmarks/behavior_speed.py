@@ -1,8 +1,8 @@
-"""What proposed goals cost: collecting with them over collecting without, and the same of the whole loop.
+"""Measures the time that proposed goals add to collection, and to the whole training loop.
 
     python benchmarks/behavior_speed.py --out behavior_speed.md
 
-Five runs of ``preset=demo algo=filtered_her``, one thread; all ways in turns, in one process.
+Five runs of ``preset=demo algo=filtered_her``, one thread. Choices of ``behavior`` take turns in one process.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ WARM, TIMED = 9_600, 640  # frames of each run
 
 
 def measure(rounds: int) -> dict[str, dict[str, float]]:
-    """Median seconds of collecting a batch, and of the loop over as many frames, of each way."""
+    """Returns the median seconds of each behavior for collecting a batch, and for a loop over its frames."""
     import torch  # noqa: PLC0415  # after the process was put on one core
 
     from torchrl_her_recipes import build, make_recipe  # noqa: PLC0415

@@ -1,4 +1,4 @@
-"""What checkpoints cost: seconds and bytes of each, and their share of a run's time at the default interval.
+"""Measures seconds and bytes of checkpoints, and their share of a run's time at the default interval.
 
 python benchmarks/checkpoint_cost.py --runs 1 15 --out checkpoint_cost.md
 """
@@ -23,7 +23,7 @@ from torchrl_her_recipes.runs.state import parts_of, run_state
 
 
 def measure(recipe: Recipe, folder: Path) -> list[str]:
-    """Trains without evaluations, with the checkpoints of a run; a row of the table."""
+    """Trains with a run's checkpoints, but without evaluations, and returns a row of the table."""
     components = build(recipe)
     trainer, path = components.trainer(), folder / "checkpoint.pt"
     parts, trained, saved = parts_of(components, trainer), 0.0, []
@@ -35,7 +35,7 @@ def measure(recipe: Recipe, folder: Path) -> list[str]:
             began = time.perf_counter()
             save_checkpoint(run_state(parts), path, keep=recipe.run.keep_checkpoints)
             saved.append(time.perf_counter() - began)
-    trained -= trainer.learner.compile_seconds  # once in the life of a machine
+    trained -= trainer.learner.compile_seconds  # left out, since a machine compiles only once
     rows = statistics.mean(sizes_of(components.buffer))
     return [
         str(recipe.run.num_runs),
@@ -60,7 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     recipe = make_recipe(load_preset("throwing"), epochs=options.epochs)
     rows = []
     for runs in options.runs:
-        with tempfile.TemporaryDirectory(dir=".") as folder:  # not in a /tmp that may be memory
+        with tempfile.TemporaryDirectory(dir=".") as folder:  # not in /tmp, which may be in memory
             rows.append(measure(recipe.replace(num_runs=runs), Path(folder)))
     header = ("runs", "rows of each", "MB", "seconds of the last", "all checkpoints", "share of the time")
     text = "\n\n".join((describe("torch", "torchrl"), table(header, rows)))

@@ -1,4 +1,4 @@
-"""Where the time of `make demo` goes: a table of parts that add up to its wall-clock.
+"""Writes a table of how long each part of `make demo` takes; the parts add up to the wall-clock time.
 
 python benchmarks/demo_time.py
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 
-_BEGAN = time.perf_counter()  # before torch is imported, which is a part of it
+_BEGAN = time.perf_counter()  # before torch is imported, since the import is one of the parts
 
 import argparse
 import tempfile
@@ -30,7 +30,7 @@ _IMPORTED = time.perf_counter()
 
 
 class Parts:
-    """Seconds of each part; time within a part that belongs to another one is counted there alone."""
+    """Seconds of each part. Time in a part that runs within another part counts for the inner part only."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = defaultdict(float)

@@ -1,4 +1,4 @@
-"""Learning curves of the two scripts that the documentation shows, in results/NAME and docs/images/NAME.png.
+"""Writes learning curves of two scripts in the documentation to results/NAME and docs/images/NAME.png.
 
     python benchmarks/doc_scripts.py own_script    # docs/own_script.md on hand_v0
     python benchmarks/doc_scripts.py recurrent     # docs/examples/recurrent.py, with and without memory
@@ -38,7 +38,7 @@ Row = dict[str, float]
 
 
 def own_script(seed: int) -> list[Row]:
-    """Runs the page from its top to the end of the loop, with another seed."""
+    """Runs the page's code, up to the end of its training loop, with a given seed; returns its curve."""
     blocks = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)[:3]
     text, names = "\n".join(blocks), {}
     first = "seed, total_frames = 0,"
@@ -52,7 +52,7 @@ def own_script(seed: int) -> list[Row]:
 
 
 def recurrent(seed: int, *, memory: bool) -> Iterable[Row]:
-    """Runs the example."""
+    """Trains the policy of the example, with or without memory; yields its learning curve."""
     return runpy.run_path(str(EXAMPLE))["train"](recurrent=memory, seed=seed)
 
 
@@ -66,7 +66,7 @@ SCRIPTS: dict[str, dict[str, tuple[str, Callable[[int], Iterable[Row]]]]] = {
 
 
 def measure(label: str, task: str, script: Callable[[int], Iterable[Row]], seeds: int) -> Combination:
-    """Runs a script with the seeds 0, 1, ..."""
+    """Runs a script with the seeds 0, 1, ... and returns all its learning curves."""
     rows, began = [], time.process_time()
     for seed in range(seeds):
         for row in script(seed):
@@ -78,7 +78,7 @@ def measure(label: str, task: str, script: Callable[[int], Iterable[Row]], seeds
 
 
 def combination(label: str, task: str, rows: list[Row], *, seconds: float) -> Combination:
-    """All runs of a script as one combination of a study."""
+    """Returns all runs of a script as one combination of a study."""
     ordered = sorted(rows, key=lambda row: (row["epoch"], row["run"]))
     return Combination(
         label=label,
@@ -96,7 +96,7 @@ def combination(label: str, task: str, rows: list[Row], *, seconds: float) -> Co
 
 
 def publish(name: str, cells: Sequence[Combination], results: Path, images: Path) -> None:
-    """Writes the numbers and the picture, and prints what was reached."""
+    """Writes the numbers and the picture of the curves, and prints the final value of each metric."""
     about: dict[str, Any] = {
         "study": name,
         "summary": SUMMARIES[name],
@@ -116,7 +116,7 @@ def publish(name: str, cells: Sequence[Combination], results: Path, images: Path
 
 
 def draw(cells: Sequence[Combination], metrics: Sequence[str], path: Path) -> None:
-    """Median, and 33rd to 67th percentile of the runs: a panel for each metric, a color for each script."""
+    """Draws median and 33rd to 67th percentile of runs: a panel for each metric, a color for each script."""
     figure = Figure(figsize=(1.0 + 4.2 * len(metrics), 3.8), layout="constrained")
     palette = colors([cell.label for cell in cells])
     for axes, metric in zip(figure.subplots(1, len(metrics), squeeze=False)[0], metrics, strict=True):

@@ -1,14 +1,15 @@
-"""Environment steps a second, beside the same world as an ordinary gymnasium environment.
+"""Measures environment steps a second, compared with the same task as an ordinary gymnasium environment.
 
     python benchmarks/env_speed.py --out env_speed.md
 
-All of them run in one process on one core, take random actions that were drawn before, and reset worlds
-whose episode ends. The peer (``peers/env.py``) has a pymunk space for each world. It is timed as gymnasium
-makes it, by ``gymnasium.make_vec``; where it is fastest, bare and without copies in a ``SyncVectorEnv``; and
-as TorchRL batches such environments, in a ``SerialEnv`` of ``GymWrapper``. Our tasks are timed in TorchRL's
-form (``make_env``) and in gymnasium's (``make_vec``). A second table has single environments in gymnasium's
-form. Before anything is timed, paths of both are compared, with a peer that finds contacts in our order and
-forgets them after each step (``exact=True``). The peer that is timed does neither, which is cheaper.
+All contenders run in one process on one core, take random actions that were drawn before, and reset
+environments whose episode ends. The ordinary environment (``peers/env.py``, the "peer") has a pymunk space
+of its own. It is timed three times: as ``gymnasium.make_vec`` makes it; in a ``SyncVectorEnv`` without
+wrappers and copies, which is fastest; and as TorchRL batches it, in a ``SerialEnv`` of ``GymWrapper``. Our
+tasks are timed in TorchRL's form (``make_env``) and in gymnasium's (``make_vec``). A second table has single
+environments in gymnasium's form. Before anything is timed, paths of our environments and of the peer are
+compared. For this comparison, the peer finds contacts in our order and forgets them after each step
+(``exact=True``), which is slower.
 """
 
 from __future__ import annotations
@@ -38,21 +39,21 @@ PACKAGES = ("torch", "torchrl", "pymunk", "gymnasium")
 PEER_ID = "torchrl_her_benchmarks/Peer-v0"
 HAND_TASKS = [name for name, task in TASKS.items() if task.effector == "hand" and task.throws]
 WORLDS = (1, 16, 64, 256, 1024)
-ACTIONS = 64  # batches of them, taken in turns
+ACTIONS = 64  # number of batches of actions, which steps take in turns
 CHECKED = (
     1,
     32,
-)  # numbers of worlds whose paths are compared: few take their steps in numbers, many in arrays
-SAME = 1e-9  # how far apart the paths of a world may be, in shown coordinates
+)  # numbers of environments whose paths are compared: few use plain numbers, many use arrays
+SAME = 1e-9  # largest difference of two paths that count as equal, in observed coordinates
 
 Step = Callable[[], object]
 
 
-# The contenders: each is a function that takes one step in all of its worlds
+# The contenders: functions that take one step in all their environments
 
 
 def stepper(env: EnvBase) -> Step:
-    """Steps and automatic resets of a TorchRL environment, as a collector takes them."""
+    """Returns a function that takes a step, with resets, in a TorchRL environment, as collectors do."""
     actions = [env.full_action_spec.rand()["action"] for _ in range(ACTIONS)]
     now, count = env.reset(), 0
 
@@ -81,12 +82,12 @@ def made_peer(task: str, worlds: int) -> Step:
 
 
 def bare_peer(task: str, worlds: int) -> Step:
-    # not copying observations is faster, and no disadvantage to those who use them at once
+    # faster without copies of observations, which are needed only by users who keep observations
     return vector_stepper(SyncVectorEnv([lambda: PeerEnv(get_task(task))] * worlds, copy=False))
 
 
 def vector_stepper(env: VectorEnv) -> Step:
-    """Steps and automatic resets of a gymnasium vector environment."""
+    """Returns a function that takes a step, with resets, in a gymnasium vector environment."""
     worlds = env.num_envs
     generator = np.random.default_rng(0)
     actions = generator.uniform(-1.0, 1.0, (ACTIONS, worlds, 3)).astype(np.float32)
@@ -102,7 +103,7 @@ def vector_stepper(env: VectorEnv) -> Step:
 
 
 def single_stepper(env: gymnasium.Env) -> Step:
-    """Steps and resets of a single gymnasium environment."""
+    """Returns a function that takes a step, with resets, in a single gymnasium environment."""
     actions = np.random.default_rng(0).uniform(-1.0, 1.0, (ACTIONS, 3)).astype(np.float32)
     env.reset(seed=0)
     count = 0
@@ -133,11 +134,11 @@ PEERS = [MADE, BARE, SERIAL]
 gymnasium.register(PEER_ID, entry_point=PeerEnv)
 
 
-# Do they do the same?
+# Comparison of paths
 
 
 def largest_difference(task: str, *, worlds: int, steps: int = 200) -> float:
-    """The largest difference between our worlds and as many exact peers, over all steps and all that is seen.
+    """Returns the largest difference of observations, rewards and ends between our environments and peers.
 
     At least half of the balls start in flight, so that they bounce; random actions catch and throw some.
     """
@@ -158,7 +159,7 @@ def largest_difference(task: str, *, worlds: int, steps: int = 200) -> float:
 
 
 def put_into_flight(env: ThrowingEnv, count: int) -> None:
-    """Throws the balls of the first worlds."""
+    """Sets the balls of the first ``count`` environments flying."""
     state = env.world_state_dict()
     state["ball"][:count] = 0.2 + torch.rand(count, 2) * torch.tensor([2.4, 5.4], dtype=torch.float64)
     state["ball_velocity"][:count] = 20.0 * torch.rand(count, 2, dtype=torch.float64) - 10.0
@@ -168,7 +169,7 @@ def put_into_flight(env: ThrowingEnv, count: int) -> None:
 
 
 def placed_peer(task: str, env: ThrowingEnv, k: int) -> PeerEnv:
-    """A peer in the state of our world k."""
+    """Makes a peer in the state of our environment k."""
     peer = PeerEnv(get_task(task), env.world, dtype=np.float64, exact=True)
     state: dict[str, Any] = {name: value[k].tolist() for name, value in env.world_state_dict().items()}
     peer.place(
@@ -186,7 +187,7 @@ def placed_peer(task: str, env: ThrowingEnv, k: int) -> PeerEnv:
 
 
 def steps_per_second(step: Step, worlds: int, seconds: float) -> float:
-    """Worlds stepped in a second, over about so many seconds."""
+    """Measures environment steps a second, over about ``seconds`` seconds."""
     taken, start = 0, time.perf_counter()
     while time.perf_counter() - start < seconds:
         step()
@@ -197,8 +198,8 @@ def steps_per_second(step: Step, worlds: int, seconds: float) -> float:
 def measure(
     steps: dict[str, Step], worlds: int, *, repeats: int, seconds: float, clock: str
 ) -> dict[str, float]:
-    """The median speed of each contender, taken in turns so that a busy machine slows all of them alike."""
-    # Half a second of steps warms up, spreads the ends of the episodes, and tells how many steps a run has.
+    """Measures each contender's median speed; they take turns, so a busy machine slows all of them alike."""
+    # Steps for half a second warm up, spread ends of episodes, and give the number of steps to time.
     counts = {name: steps_per_second(step, 1, 0.5) * seconds for name, step in steps.items()}
 
     def run(step: Step, count: int) -> int:
@@ -266,7 +267,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         difference = max(largest_difference(options.task, worlds=worlds) for worlds in CHECKED)
         if difference > SAME:
             raise RuntimeError(
-                f"the peer is another world: paths of {options.task} differ by {difference:.1e}"
+                f"paths of {options.task} in our environment and the peer differ by {difference:.1e}"
             )
         rows = {
             worlds: measure(

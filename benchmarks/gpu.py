@@ -1,11 +1,11 @@
-"""What a GPU gives: gradient steps, a hundred runs as one program, and memory, beside one core.
+"""Compares a GPU with one core: gradient steps, a hundred runs as one program, and memory.
 
     python benchmarks/gpu.py --out bench_gpu.md
     python benchmarks/gpu.py --small
 
-It is meant to take less than ten minutes. Where there is no GPU the tables say "not measured" and have the
-CPU's figures only, with fewer runs and frames. A gradient step is one of the training loop: transitions are
-drawn by their priorities, learned from, and get new priorities.
+The benchmark takes less than ten minutes. Without a GPU the tables have "not measured" for its figures, and
+figures of the CPU only, with fewer runs and frames. A gradient step is one of the training loop: transitions
+are drawn by their priorities, learned from, and get new priorities.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ from torchrl_her_recipes import Recipe, load_preset, make_recipe
 from torchrl_her_recipes.config.shortcuts import merge
 
 NOT_MEASURED = "not measured"
-STEPS = 64  # of a measurement: two draws
+STEPS = 64  # gradient steps in a measurement: two samples of the replay buffer
 REPEATS = 5
 AIM, MINUTES = 0.9, 5.0
 
 
 class Setting(NamedTuple):
-    """Whose gradient steps are measured."""
+    """Number of runs, and options, for which gradient steps are measured."""
 
     name: str
     runs: int
@@ -68,7 +68,7 @@ def recipe_of(setting: Setting, device: str, compile: str) -> Recipe:
 
 
 def seconds_a_step(recipe: Recipe) -> float:
-    """The median of some measurements, after two that compile and record."""
+    """Returns a gradient step's median seconds, after two measurements that compile and record it."""
     ours = Ours(recipe)
     ours.fill(recipe.collection.num_envs * 50)
     times = []
@@ -82,7 +82,7 @@ def seconds_a_step(recipe: Recipe) -> float:
 
 
 def steps_table(*, small: bool) -> str:
-    """Milliseconds of a gradient step."""
+    """Writes a table of milliseconds of a gradient step, by setting and device."""
     there = torch.cuda.is_available()
     rows = []
     for setting in SETTINGS:
@@ -100,7 +100,7 @@ def steps_table(*, small: bool) -> str:
 
 
 def climb_table(*, small: bool) -> str:
-    """How long many runs of ``hand_v1`` take to a median success of 90 %, as one program on a GPU."""
+    """Measures how long 100 runs of ``hand_v1``, as one program, take to a median success of 90 %."""
     there = torch.cuda.is_available()
     options = ["preset=demo", "algo=cher", "checkpoint_interval=1000"]
     if there and not small:
@@ -116,12 +116,12 @@ def climb_table(*, small: bool) -> str:
 
 
 def climb(options: Sequence[str]) -> tuple[float, float, str]:
-    """Trains until the aim is reached, or for some minutes: seconds, median success and memory."""
+    """Trains up to the success ``AIM``, or for some minutes; returns seconds, median success and memory."""
     with tempfile.TemporaryDirectory() as folder:
         run = Path(folder) / "run"
         command = [sys.executable, "-m", "torchrl_her_recipes", "train", *options, f"folder={run}"]
         began, found, memory = time.perf_counter(), 0.0, 0
-        others = memory_in_use()  # this program's
+        others = memory_in_use()  # memory of other programs and of this one
         errors = Path(folder) / "errors"
         with (
             open(errors, "w") as said,
@@ -139,7 +139,7 @@ def climb(options: Sequence[str]) -> tuple[float, float, str]:
 
 
 def memory_in_use() -> int:
-    """Bytes of the GPU that all programs have together; 0 without one."""
+    """Returns the bytes of GPU memory that all programs use together; 0 without a GPU."""
     if not torch.cuda.is_available():
         return 0
     free, every = torch.cuda.mem_get_info()
@@ -147,7 +147,7 @@ def memory_in_use() -> int:
 
 
 def last_median(path: Path) -> float:
-    """The median success of the runs after their last epoch; 0 if there is none yet."""
+    """Returns the median success of the runs in their last epoch; 0 before the first evaluation."""
     if not path.is_file():
         return 0.0
     with open(path, newline="") as file:

@@ -1,4 +1,4 @@
-"""Divergence of virtual goals from the target when q is brought up to date once a batch, or an episode.
+"""Measures how far virtual goals are from the target q* if q is updated once for each batch or episode.
 
     python benchmarks/ibs_update.py --out ibs_update.md
 
@@ -27,7 +27,7 @@ GRID = GoalGrid((-1.0, -1.0), (1.0, 1.0), (20, 20))
 
 
 def write(env: ThrowingEnv, episodes: TensorDictBase, at_once: int) -> tuple[float, float]:
-    """KL(q || q*) afterwards, and the seconds that it took."""
+    """Writes episodes, ``at_once`` in a call; returns the final KL(q || q*) and the seconds of writing."""
     goals = env.goal_distribution
     weights = Instructiveness(
         GRID, partial(box_target, GRID, goals.low, goals.high), sigma=0.4, start_factor=1.0

@@ -1,4 +1,4 @@
-"""What the benchmarks share: naming the machine, timing in turns, writing tables."""
+"""Functions that benchmarks share: they name the machine, time contenders in turns, and write tables."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pathlib import Path
 
 
 def describe(*packages: str) -> str:
-    """The machine and the versions of some packages, in a line."""
+    """Describes the machine and the versions of some packages, in one line."""
     model = platform.processor() or platform.machine()
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.exists():
@@ -27,12 +27,12 @@ def describe(*packages: str) -> str:
 
 @contextlib.contextmanager
 def one_core(core: int | None = None) -> Iterator[None]:
-    """Keeps this process with all its threads on one core meanwhile, where systems allow that.
+    """Context manager that keeps all threads of this process on one core, if the system allows it.
 
-    Enter it before libraries make their threads, so that they count one core. XLA is told to use one thread.
+    Enter it before libraries make threads, so that they see a single core. XLA is set to use one thread.
 
     Args:
-        core: its number; the last one that the process may use if None.
+        core: index of the core; if None, the last core that the process may use.
     """
     os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
     os.environ.setdefault("JAX_PLATFORMS", "cpu")
@@ -48,8 +48,8 @@ def one_core(core: int | None = None) -> Iterator[None]:
 
 
 def _stay_on(cores: set[int]) -> None:
-    for thread in os.listdir("/proc/self/task"):  # each has cores of its own
-        with contextlib.suppress(ProcessLookupError):  # it has just ended
+    for thread in os.listdir("/proc/self/task"):  # cores are set for each thread
+        with contextlib.suppress(ProcessLookupError):  # the thread has just ended
             os.sched_setaffinity(int(thread), cores)
 
 
@@ -59,13 +59,13 @@ CLOCKS = {"wall": time.perf_counter, "cpu": time.process_time}
 def medians(
     contenders: Mapping[str, Callable[[], int]], *, repeats: int, clock: str = "wall", warm_up: int = 0
 ) -> dict[str, float]:
-    """Seconds for one piece of work of each contender: the median of repeats taken in turns.
+    """Measures the seconds for one unit of each contender's work: the median of repeats, taken in turns.
 
     Args:
-        contenders: each does some work and returns how many pieces it was.
-        repeats: of each.
-        clock: wall, or cpu: the time that the process was given, which other work on its core leaves alone.
-        warm_up: how often each does its work before that, to compile what it compiles.
+        contenders: functions that do some work and return its number of units.
+        repeats: number of repeats of each contender.
+        clock: ``wall``; or ``cpu``, the processor time of this process, without other work on its core.
+        warm_up: number of calls of each contender before it is timed, for instance to compile.
     """
     now = CLOCKS[clock]
     for work in contenders.values():
@@ -81,13 +81,13 @@ def medians(
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A markdown table."""
+    """Formats a Markdown table."""
     lines = [header, ["---"] * len(header), *rows]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
 def publish(text: str, out: Path | None) -> None:
-    """Prints a text, and writes it to a file if there is to be one."""
+    """Prints a text, and writes it to a file unless ``out`` is None."""
     print(text)
     if out is not None:
         out.write_text(text + "\n")

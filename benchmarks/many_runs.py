@@ -1,10 +1,10 @@
-"""What a run costs, in time and memory, as more of them train as one program.
+"""Measures time and memory per run, depending on the number of runs that train as one program.
 
     python benchmarks/many_runs.py --out many_runs.md
     python benchmarks/many_runs.py --runs 100 --full
 
-Each number of runs is a program of its own: the loop of ``preset=demo algo=cher``, one thread. Memory is the
-most that the program had, and what it will have when all buffers are full, of which rows are counted.
+Each number of runs is measured in a program of its own: the training loop of ``preset=demo algo=cher``, with
+one thread. Memory is the program's maximum, and its size with full buffers, computed from their row size.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ WARM, TIMED = 6_400, 5_120  # frames of each run
 
 
 def measure(runs: int, *, full: bool) -> dict[str, float]:
-    """Seconds, bytes and gradient steps of a number of runs, in this process; with full buffers if asked."""
+    """Trains runs in this process, first filling buffers if ``full``; returns seconds, bytes and steps."""
     import torch  # noqa: PLC0415  # after the process was put on one core
 
     from torchrl_her_recipes import build, make_recipe  # noqa: PLC0415
@@ -75,7 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--runs", type=int, nargs="+", default=RUNS)
     parser.add_argument("--full", action="store_true", help="fill all buffers first, which takes minutes")
-    parser.add_argument("--only", type=int, help=argparse.SUPPRESS)  # in a program of its own
+    parser.add_argument("--only", type=int, help=argparse.SUPPRESS)  # for the process of one measurement
     parser.add_argument("--out", type=Path, help="a Markdown file to write the table to, too")
     options = parser.parse_args(arguments)
     if options.only is not None:

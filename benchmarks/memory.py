@@ -1,10 +1,10 @@
-"""Bytes that a replay buffer needs for a million rows, and what virtual rows as references would change.
+"""Measures the bytes of a replay buffer of a million rows, stored as copies or as references.
 
     python benchmarks/memory.py --out memory.md
 
-Rows are those of `hand_v1` under HER with k = 4. "References" is a sketch of the other way to store virtual
-rows: each is the place of its real row and of the row whose achieved goal it takes, and is built when it is
-drawn. It shows sizes and times alone: real rows pushed out before their virtual rows are not dealt with.
+Rows are those of `hand_v1` under HER with k = 4. "References" is a sketch of another way to store virtual
+rows: as the index of the real row and of the row whose achieved goal is taken; they are built when they are
+sampled. It shows sizes and times only, and ignores that real rows may be overwritten before virtual ones.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ MILLION, DRAWN = 1_000_000, 512
 
 
 def size(rows: TensorDictBase) -> int:
-    """Bytes of all entries."""
+    """Returns the number of bytes of all entries."""
     return sum(entry.nbytes for entry in rows.values(True, True))
 
 
 class References:
-    """Virtual rows as two numbers each, in front of the real ones, which refer to themselves."""
+    """Virtual rows, stored as two indices each, before real rows, which refer to themselves."""
 
     def __init__(self, real: TensorDictBase, reward: EnvReward) -> None:
         self.real, self.reward = real, reward
@@ -61,7 +61,7 @@ class References:
 
 
 def copies(batch: TensorDictBase, reward: EnvReward) -> TensorDictBase:
-    """The rows as the writer stores them."""
+    """Returns rows as the library's writer stores them: virtual rows are copies."""
     writer = HERWriter(reward, k=K, exclude=NOT_STORED)
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(ROWS), writer=writer)
     buffer.extend(batch.copy())

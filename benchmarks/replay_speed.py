@@ -1,11 +1,11 @@
-"""Replay of several runs in one buffer, beside as many ordinary buffers with a call each.
+"""Compares replay of several runs in one buffer with an ordinary buffer and a call for each run.
 
 python benchmarks/replay_speed.py --out replay_speed.md
 
-Both sides hold the same rows, as of ``hand_v1``, relabel them with the filter and k = 4, and draw by
-priority. The ordinary buffers are TorchRL's, with this library's ``HERWriter`` and TorchRL's own storage and
-``PrioritizedSampler``; what they draw is stacked, as a learner of several runs needs it. Each side hands over
-rows whose memory is contiguous, so that neither leaves a copy to the learner.
+Both contenders store the same rows, which look like ``hand_v1``, relabel with the filter and k = 4, and
+sample by priority. The ordinary buffers are TorchRL's, with this library's ``HERWriter`` and TorchRL's own
+storage and ``PrioritizedSampler``; samples are stacked, as a learner of several runs needs them. Both
+contenders return contiguous rows, so that the learner need not copy them.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from torchrl_her import EnvReward, HERWriter
 from torchrl_her.replay_buffers import PackedStorage, RunsPrioritizedSampler
 from torchrl_her_envs import ThrowingEnv, make_env
 
-ENVS, STEPS, EPISODE = 64, 10, 50  # of each run; steps of a batch and of an episode
+ENVS, STEPS, EPISODE = 64, 10, 50  # environments of each run; steps of a batch and of an episode
 BATCH, CAPACITY = 256, 100_000
 NOT_STORED = ("state", "achieved_goal", "collector")  # as in the recipes
 ALPHA, BETA = 0.3, 0.4
@@ -38,7 +38,7 @@ Work = Callable[[], int]
 
 
 def collect(env: ThrowingEnv, runs: int) -> list[TensorDictBase]:
-    """The batches [R * N, T] of an episode in each environment, with balls on random walks."""
+    """Collects an episode of each environment as batches [R * N, T]; balls are set on random walks."""
     collector = Collector(env, frames_per_batch=runs * ENVS * STEPS, total_frames=-1)
     walk = (torch.randn(runs * ENVS, EPISODE + 1, 2) * env.threshold).cumsum(1)
     batches = []
@@ -62,7 +62,7 @@ def make_writer(env: ThrowingEnv, **options: Any) -> HERWriter:
 
 
 def make_one(env: ThrowingEnv, runs: int) -> TensorDictReplayBuffer:
-    """One buffer of all runs."""
+    """Makes one buffer for all runs."""
     shared: dict[str, Any] = {
         "runs": runs,
         "generators": [torch.Generator().manual_seed(run) for run in range(runs)],
@@ -76,7 +76,7 @@ def make_one(env: ThrowingEnv, runs: int) -> TensorDictReplayBuffer:
 
 
 def make_many(env: ThrowingEnv, runs: int) -> list[TensorDictReplayBuffer]:
-    """An ordinary buffer for each run."""
+    """Makes an ordinary buffer for each run."""
     buffers = []
     for run in range(runs):
         buffer = TensorDictReplayBuffer(
@@ -104,7 +104,7 @@ def write_many(buffers: list[TensorDictReplayBuffer], batches: list[TensorDictBa
 
 
 def draw_one(buffer: TensorDictReplayBuffer, runs: int, size: int) -> int:
-    """Draws rows [R, size] and sets their priorities, as the trainer does."""
+    """Samples rows [R, size] and sets their priorities, as the trainer does."""
     drawn = buffer.sample(runs * size)
     rows = drawn.view(runs, size).contiguous()
     own = drawn.select("index")
@@ -123,7 +123,7 @@ def draw_many(buffers: list[TensorDictReplayBuffer], size: int) -> int:
 
 
 def measure(runs: int, repeats: int, clock: str) -> list[list[str]]:
-    """The rows of the table for a number of runs."""
+    """Measures both contenders; returns rows of the table for a number of runs."""
     env = make_env("hand_v1", num_envs=runs * ENVS, seed=0)
     batches, one, many = collect(env, runs), make_one(env, runs), make_many(env, runs)
     while len(many[0]) < CAPACITY:  # full, so that no timed work touches memory for the first time

@@ -1,4 +1,4 @@
-"""All benchmarks one after the other, in one report.
+"""Runs all benchmarks one after the other, and writes one report.
 
 python benchmarks/run.py --out runs/bench.md
 """
@@ -49,7 +49,7 @@ def main() -> int:
             failed |= bool(import_module(name).main(["--out", str(table)]))
             command = f"python benchmarks/run.py {name}" if "." in name else f"python benchmarks/{name}.py"
             sections.append(f"## {PARTS[name]}\n\n`{command}`\n\n{table.read_text().strip()}")
-        options.out.write_text("\n\n".join(sections) + "\n")  # what there is, should a later part fail
+        options.out.write_text("\n\n".join(sections) + "\n")  # after each part, in case a later part fails
     print(f"\nreport: {options.out}")
     return int(failed)
 

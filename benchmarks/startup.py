@@ -1,4 +1,4 @@
-"""Seconds and memory until a new Python process is ready, beside what the libraries below need by themselves.
+"""Measures seconds and memory until a Python process is ready, for this package and libraries that it needs.
 
 python benchmarks/startup.py --out startup.md
 """
@@ -41,11 +41,11 @@ PROGRAMS = {
 
 
 def start(command: Sequence[str]) -> tuple[float, float]:
-    """Seconds until a process has ended, and its greatest memory in MB."""
+    """Runs a command; returns the seconds until it has ended, and its largest memory in MB."""
     began = time.perf_counter()
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     _, _, usage = os.wait4(process.pid, 0)
-    scale = 1e6 if sys.platform == "darwin" else 1e3  # bytes there, kilobytes elsewhere
+    scale = 1e6 if sys.platform == "darwin" else 1e3  # in bytes on macOS, in kilobytes elsewhere
     return time.perf_counter() - began, usage.ru_maxrss / scale
 
 
@@ -61,7 +61,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     rows = []
     for name, program in PROGRAMS.items():
         if name.startswith(options.only):
-            start([options.python, *program])  # reads the files from disk, and writes byte code
+            start([options.python, *program])  # not timed: reads files from disk and writes bytecode
             starts = [start([options.python, *program]) for _ in range(options.repeats)]
             seconds, memory = (statistics.median(own) for own in zip(*starts, strict=True))
             rows.append([name, f"{seconds:.2f}", f"{memory:,.0f}"])

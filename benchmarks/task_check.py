@@ -1,7 +1,7 @@
 """Shows that every task can be solved, and that none is solved by chance.
 
-For each task a scripted controller and a random policy play the first episode of many worlds. The table
-tells how many of these end with the goal achieved, and the status is 1 if a task is outside its limits.
+For each task a scripted controller and a random policy play the first episode of many environments. The table
+has the share of episodes that achieve their goal. The exit status is 1 if a task is outside its limits.
 
     python benchmarks/task_check.py --out tasks.md
 """
@@ -19,20 +19,20 @@ from tensordict import TensorDictBase
 from torchrl_her_envs import TASKS, ThrowingEnv, make_controller, make_env
 
 SCRIPTED_AT_LEAST = 0.95
-RANDOM_AT_MOST = {"v0": 0.10, "v1": 0.01, "v2": 0.10}  # by the end of a task's name; reaching has no limit
+RANDOM_AT_MOST = {"v0": 0.10, "v1": 0.01, "v2": 0.10}  # by suffix of the name; reaching tasks have no limit
 HEADER = ("task", "scripted %", "random %", "limits")
 
 
 def success_rate(env: ThrowingEnv, policy: Callable[[TensorDictBase], TensorDictBase] | None) -> float:
-    """The share of worlds that achieve their goal in their first episode; a policy of None acts at random."""
+    """Returns the share of first episodes that achieve their goal; a policy of None acts at random."""
     after = env.rollout(env.world.max_steps, policy, break_when_any_done=False)["next"]
     done = after["done"].long()
-    first = done.cumsum(1) - done == 0  # later steps are those of an episode that followed by itself
+    first = done.cumsum(1) - done == 0  # steps after the first end belong to the next episode
     return (after["terminated"] & first).any(1).double().mean().item()
 
 
 def check(name: str, *, episodes: int, seed: int) -> tuple[tuple[str, ...], bool]:
-    """One row of the table, and whether the task is within its limits."""
+    """Measures a task; returns a row of the table, and whether the task is within its limits."""
     env = make_env(name, num_envs=episodes, seed=seed)
     scripted = success_rate(env, make_controller(env))
     env.set_seed(seed)
@@ -49,7 +49,7 @@ def check(name: str, *, episodes: int, seed: int) -> tuple[tuple[str, ...], bool
 
 
 def as_markdown(rows: Sequence[Sequence[str]]) -> str:
-    """A table whose first row is its header."""
+    """Formats a Markdown table whose first row is the header."""
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     lines = [
         "| " + " | ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) + " |"

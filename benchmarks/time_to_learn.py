@@ -1,4 +1,4 @@
-"""Seconds and frames to a success rate, beside Stable-Baselines3 and SBX with HER: one curve for each seed.
+"""Measures seconds and frames up to a success rate, for this library, Stable-Baselines3 and SBX with HER.
 
     python benchmarks/time_to_learn.py --out time_to_learn.md
     python benchmarks/time_to_learn.py --preset benchmarks/presets/fetch_push.yaml --only SBX-SAC \\
@@ -7,12 +7,12 @@
         --aim 0.95 --window 2 --minutes 60 --epochs 200 --epoch-frames 5000 --first-seed 100 --repeats 1 \\
         --curves push_seconds
 
-All train in as many worlds of the same task with the same networks, batches, discount and number of
-gradient steps, except the contenders named Zoo, which have the RL Zoo's options for the task. After each
+All contenders train in the same task with the same number of environments, networks, batches, discount and
+number of gradient steps, except those named Zoo, which have the RL Zoo's options for the task. After each
 epoch the success of greedy episodes in the same environment is measured, which is not timed. Seconds are
-those of processor time, on one core. Runs are taken in turns. Each ends when its last evaluations reach the
-aim on average (never, if the aim is above 1). With ``--curves`` a run is written when it ends, and is not
-made again: each setting needs a file of its own.
+processor time on one core. Contenders take turns. A run ends when its last evaluations reach the aim on
+average (never, if the aim is above 1). With ``--curves``, finished runs are written to a file and not trained
+again, so each setting needs a file of its own.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ Learned = tuple[Policy, EnvBase]  # a greedy policy and environments to evaluate
 
 
 class Point(NamedTuple):
-    """A curve's: what an evaluation found after so many frames, and seconds of training."""
+    """A point of a learning curve: success after a number of frames and of seconds of training."""
 
     frames: int
     seconds: float
@@ -55,10 +55,10 @@ class Point(NamedTuple):
 
 
 def ours(recipe: Recipe, _noise: float) -> Iterator[Learned]:
-    """Trains, and hands out the greedy policy after each epoch. Explores as the recipe says."""
+    """Trains this library's learner of a recipe, and yields the greedy policy after each epoch."""
     components = build(recipe)
     if components.curriculum is not None and not components.curriculum.progress.by_episode:
-        raise ValueError(f"algo={recipe.hindsight.algo} climbs in torchrl-her train only, not here")
+        raise ValueError(f"algo={recipe.hindsight.algo} learns stages, which only torchrl-her train supports")
     trainer = components.trainer()
     while True:
         trainer.epoch()
@@ -66,19 +66,19 @@ def ours(recipe: Recipe, _noise: float) -> Iterator[Learned]:
 
 
 def ddpg(recipe: Recipe, noise: float) -> Iterator[Learned]:
-    """The same of Stable-Baselines3's DDPG."""
+    """Trains DDPG of Stable-Baselines3, and yields the greedy policy after each epoch."""
     return _learn(recipe, make_sb3(recipe, noise=noise))
 
 
 def sac(recipe: Recipe, _noise: float) -> Iterator[Learned]:
-    """The same of SBX's SAC, which explores by the entropy of its policy."""
+    """Trains SAC of SBX, which explores by its stochastic policy, and yields the policy after each epoch."""
     from peers.sbx_sac import make_sac  # noqa: PLC0415  # only those who ask for it wait for JAX
 
     return _learn(recipe, make_sac(recipe))
 
 
 def zoo(algorithm: str) -> Callable[[Recipe, float], Iterator[Learned]]:
-    """The same of an algorithm with the RL Zoo's options for the task; the recipe gives task and seed."""
+    """Returns a function that trains an algorithm with the RL Zoo's options on a recipe's task and seed."""
 
     def train(recipe: Recipe, _noise: float) -> Iterator[Learned]:
         from peers.zoo import make_zoo  # noqa: PLC0415  # as above
@@ -89,7 +89,7 @@ def zoo(algorithm: str) -> Callable[[Recipe, float], Iterator[Learned]]:
 
 
 def _learn(recipe: Recipe, model: OffPolicyAlgorithm) -> Iterator[Learned]:
-    """Trains a peer's model, and hands out its greedy policy after each epoch."""
+    """Trains another library's model, and yields its greedy policy after each epoch."""
     worlds = evaluation_envs(recipe.task.name, recipe.evaluation.episodes)
     env = TaskEnvs.of(recipe).make(worlds, [recipe.run.seed + (1 << 32)], scaled=False)
 
@@ -103,8 +103,8 @@ def _learn(recipe: Recipe, model: OffPolicyAlgorithm) -> Iterator[Learned]:
         yield policy, env
 
 
-Curves = Mapping[str, Sequence[Sequence[Point]]]  # of each seed, by contender
-Runs = dict[tuple[str, int], list[Point]]  # by contender and seed
+Curves = Mapping[str, Sequence[Sequence[Point]]]  # curves of all seeds, by contender
+Runs = dict[tuple[str, int], list[Point]]  # curves by contender and seed
 
 CONTENDERS = {"this": ours, "Stable-Baselines3": ddpg, "SBX-SAC": sac} | {
     f"Zoo-{name}": zoo(name) for name in ("TQC", "SAC", "SBX-TQC")
@@ -112,7 +112,7 @@ CONTENDERS = {"this": ours, "Stable-Baselines3": ddpg, "SBX-SAC": sac} | {
 
 
 def race(name: str, recipe: Recipe, *, noise: float, aim: float, window: int, minutes: float) -> list[Point]:
-    """The curve until the mean of the last evaluations is at the aim, the last epoch, or the time is up."""
+    """Trains until the mean of the last evaluations reaches the aim, or a limit; returns the curve."""
     curve: list[Point] = []
     training, seconds = CONTENDERS[name](recipe, noise), 0.0
     for epoch in range(1, recipe.run.epochs + 1):
@@ -136,7 +136,7 @@ def column(values: Sequence[float], form: str) -> str:
 
 
 def line(name: str, curves: Sequence[Sequence[Point]], aim: float, window: int) -> list[str]:
-    """A row of the table: one number for each seed."""
+    """Returns a row of the table, with one number for each seed in each column."""
     best = [max(point.success for point in curve) for curve in curves]
     ends = [statistics.fmean(point.success for point in curve[-window:]) for curve in curves]
     return [
@@ -150,7 +150,7 @@ def line(name: str, curves: Sequence[Sequence[Point]], aim: float, window: int) 
 
 
 def write_runs(runs: Runs, path: Path) -> None:
-    part = path.with_suffix(".part")  # so that a stop in between loses nothing
+    part = path.with_suffix(".part")  # renamed when complete, so an interruption loses nothing
     with open(part, "w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(("contender", "seed", *Point._fields))
@@ -160,7 +160,7 @@ def write_runs(runs: Runs, path: Path) -> None:
 
 
 def read_runs(path: Path) -> Runs:
-    """What was written before, if anything."""
+    """Reads the runs in a file; returns an empty dict if there is no file."""
     runs: Runs = {}
     if path.is_file():
         with open(path, newline="") as file:
@@ -171,7 +171,7 @@ def read_runs(path: Path) -> Runs:
 
 
 def draw_curves(curves: Curves, path: Path, *, title: str) -> None:
-    """Success over frames, and over seconds of training: a line for each seed."""
+    """Draws success over frames, and over seconds of training, with a line for each seed."""
     figure = Figure(figsize=(9.4, 3.8), layout="constrained")
     panels = figure.subplots(1, 2, sharey=True)
     for axes, field in zip(panels, ("frames", "seconds"), strict=True):

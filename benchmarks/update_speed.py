@@ -1,12 +1,12 @@
-"""Gradient steps and the whole training loop beside SBX, Stable-Baselines3 and TorchRL's own pieces.
+"""Compares gradient steps and training loops with SBX, Stable-Baselines3 and TorchRL's loss and buffer.
 
     python benchmarks/update_speed.py --out update_speed.md
     python benchmarks/update_speed.py --tables steps --repeats 15
 
-All train in one process on one core, in turns, after each has compiled what it compiles. They have the same
-task, number of environments, networks (three hidden layers), batches, discount, learning rate, target updates
-and share of virtual transitions, and collect as many frames between two rounds of as many gradient steps.
-Beneath the tables stands what differs.
+All contenders train in one process on one core, in turns, after compilation. They have the same task, number
+of environments, networks (three hidden layers), batches, discount, learning rate, target updates, share of
+virtual transitions, frames between two rounds of gradient steps, and gradient steps in a round. Remaining
+differences are listed below the tables.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ FILL = 20_480  # frames in the buffers before anything is timed
 STEPS = 200  # gradient steps in one measurement
 RUNS = 15
 
-STEP_SETTINGS = ((64, 64), (64, 256), (256, 256))  # width of the hidden layers, batch
+STEP_SETTINGS = ((64, 64), (64, 256), (256, 256))  # width of the hidden layers, batch size
 STEP_PEERS: tuple[type[Peer], ...] = (
     Ours,
     OursHalf,
@@ -42,30 +42,30 @@ STEP_PEERS: tuple[type[Peer], ...] = (
     SB3TD3,
     TorchRLPieces,
 )
-LOOP_SETTINGS = tuple((batch, frames) for batch in (64, 256) for frames in (1, 5, 20))  # frames for a step
+LOOP_SETTINGS = tuple((batch, frames) for batch in (64, 256) for frames in (1, 5, 20))  # frames per update
 LOOP_PEERS: tuple[type[Peer], ...] = (Ours, OursHalf, SBXTD3, SB3DDPG)
-ROUNDS = {1: 1, 5: 5, 20: 10}  # rounds in one measurement, by frames for a gradient step
+ROUNDS = {1: 1, 5: 5, 20: 10}  # rounds in one measurement, by frames per gradient step
 ENV_COUNTS = (1, 8, 16, 64, 160)
 
 
 class Timing(NamedTuple):
-    """How to measure."""
+    """Settings of measurements: number of repeats, and the clock."""
 
     repeats: int
     clock: str
 
     def medians(self, contenders: Mapping[str, Callable[[], int]]) -> dict[str, float]:
-        """Seconds for a piece of work of each contender."""
+        """Measures the median seconds for a unit of each contender's work."""
         return medians(contenders, repeats=self.repeats, clock=self.clock, warm_up=2)
 
 
 def recipe_for(**options: Any) -> Recipe:
-    """A long run, in which ``compile=auto`` compiles whatever gains by it."""
+    """Makes the recipe of a run that is so long that ``compile=auto`` compiles it."""
     return make_recipe(load_preset("throwing"), task=TASK, algo="her", episodes=1, epochs=1_000, **options)
 
 
 def frames_in_round(recipe: Recipe) -> int:
-    """What is collected between two rounds of gradient steps."""
+    """Returns the number of frames that are collected between two rounds of gradient steps."""
     return recipe.collection.num_envs * recipe.collection.steps_per_batch
 
 
@@ -83,7 +83,7 @@ def differences(peers: Sequence[type[Peer]]) -> str:
 
 
 def steps_table(timing: Timing) -> str:
-    """Gradient steps, with everything that belongs to them."""
+    """Measures complete gradient steps (see ``Peer.gradient_steps``), and formats a table."""
     rows = []
     for hidden, batch in STEP_SETTINGS:
         recipe = recipe_for(hidden=hidden, batch_size=batch)
@@ -108,7 +108,7 @@ def steps_table(timing: Timing) -> str:
 
 
 def loop_table(timing: Timing) -> str:
-    """Playing, storing and learning."""
+    """Measures the whole training loop (collecting, storing and learning), and formats a table."""
     rows = []
     for batch, frames_per_update in LOOP_SETTINGS:
         recipe = recipe_for(batch_size=batch, frames_per_update=frames_per_update)
@@ -138,7 +138,7 @@ def loop_table(timing: Timing) -> str:
 
 
 def envs_table(timing: Timing) -> str:
-    """With how many environments the others are fastest, where environments take the largest share."""
+    """Measures loops of other libraries by number of environments, where environments take most time."""
     base = recipe_for(batch_size=64, frames_per_update=20)
     in_round = frames_in_round(base)
     recipes = {
@@ -155,7 +155,7 @@ def envs_table(timing: Timing) -> str:
 
 
 def runs_table(timing: Timing) -> str:
-    """Fifteen runs beside one."""
+    """Compares 15 runs trained side by side with a single run, and formats a table."""
     rows = []
     for batch in (64, 256):
         one, together = (filled(Ours(recipe_for(batch_size=batch, num_runs=runs))) for runs in (1, RUNS))
@@ -205,7 +205,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, help="write the tables to this file, too")
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
-    torch.set_flush_denormal(True)  # as in runs
+    torch.set_flush_denormal(True)  # as a run of the recipes does
     parts = [describe("torch", "torchrl", "stable-baselines3", "sbx-rl", "jax")]
     print(parts[0], flush=True)
     with one_core(options.core):

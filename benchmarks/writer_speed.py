@@ -1,10 +1,10 @@
-"""Time to write with hindsight, beside TorchRL's plain writer for the same number of rows.
+"""Compares the time of writing with hindsight with TorchRL's plain writer, for the same number of rows.
 
     python benchmarks/writer_speed.py --out writer_speed.md
 
 A batch of 800 episodes of 50 steps is written in one call. With k = 4 virtual rows for each real one
-that makes 200,000 rows; the plain writer is given the very same 200,000 rows, ready-made. Filtered HER
-is given the same batch, and one in which no ball moves, so that the filter drops all virtual goals.
+that makes 200,000 rows; the plain writer gets the same 200,000 rows, ready-made. Filtered HER writes
+the same batch, and one in which no ball moves, so that the filter drops all virtual goals.
 The checks that HERWriter makes of each write, that goals and rewards are finite, are timed alone, too.
 """
 
@@ -55,7 +55,7 @@ PLAIN, HER, COUNTED, FILTERED, IBS, RESTING, CHECKS = (
 
 
 def collect(env: ThrowingEnv) -> TensorDictBase:
-    """A collector's batch [N, T] of whole episodes. Under random actions hardly any ball moves."""
+    """Collects a batch [N, T] of whole episodes, in which random actions move hardly any ball."""
     batch = Collector(env, frames_per_batch=EPISODES * STEPS, total_frames=-1).next()
     last = torch.arange(STEPS) == STEPS - 1
     ends = last.view(1, STEPS, 1).expand(EPISODES, STEPS, 1)
@@ -65,7 +65,7 @@ def collect(env: ThrowingEnv) -> TensorDictBase:
 
 
 def move_balls(batch: TensorDictBase, env: ThrowingEnv) -> TensorDictBase:
-    """The same with balls on random walks: by about the threshold a step, as a hand at full speed moves."""
+    """Returns a batch with balls on random walks, with steps of about the threshold, like a fast hand."""
     walk = (torch.randn(EPISODES, STEPS + 1, 2) * env.threshold).cumsum(1)
     moving = batch.clone()
     moving["achieved_goal"], moving["next", "achieved_goal"] = walk[:, :-1], walk[:, 1:]
@@ -91,7 +91,7 @@ def make_ibs(env: ThrowingEnv, grid: GoalGrid) -> Instructiveness:
 
 
 def make_cases() -> dict[str, tuple[TensorDictReplayBuffer, TensorDictBase]]:
-    """Each writer in a buffer of its own, and the batch that it is given."""
+    """Makes a buffer for each writer, and the batch that it writes, by the writer's name in the table."""
     env = make_env("hand_v1", num_envs=EPISODES, seed=0)
     resting = collect(env)
     moving = move_balls(resting, env)
@@ -111,12 +111,12 @@ def make_cases() -> dict[str, tuple[TensorDictReplayBuffer, TensorDictBase]]:
 
 
 def write(buffer: TensorDictReplayBuffer, batch: TensorDictBase) -> Callable[[], object]:
-    # A shallow copy: the buffer adds its index to what it is given.
+    # A shallow copy, since the buffer adds an entry ``index`` to the batch.
     return lambda: buffer.extend(batch.copy())
 
 
 def checks(buffer: TensorDictReplayBuffer, batch: TensorDictBase) -> Callable[[], object]:
-    """What a writer checks of a batch, and of the rewards of its virtual transitions."""
+    """Returns a function that makes a writer's checks of a batch and of rewards of virtual transitions."""
     writer, rewards = buffer.writer, torch.zeros(ROWS * K // (K + 1), 1)
 
     def check() -> None:
@@ -139,7 +139,7 @@ def warm(buffer: TensorDictReplayBuffer, batch: TensorDictBase) -> None:
 
 
 def interleaved(actions: dict[str, Callable[[], object]], repeats: int) -> dict[str, list[float]]:
-    """Seconds of each action, taken in turns so that a busy machine slows all of them alike."""
+    """Measures seconds of each action; they take turns, so a busy machine slows all of them alike."""
     seconds: dict[str, list[float]] = {name: [] for name in actions}
     for _ in range(repeats):
         for name, action in actions.items():

@@ -1,1 +1,1 @@
-"""What other processes give."""
+"""Benchmarks of collecting in other processes."""

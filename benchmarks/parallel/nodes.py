@@ -1,9 +1,10 @@
-"""FetchPush collected on two nodes of a Ray cluster, one of which dies, and another one comes.
+"""Collects FetchPush on two nodes of a Ray cluster; one of them dies, and later a new node joins.
 
     python benchmarks/run.py parallel.nodes
 
-Both nodes are made on this machine, so the speed is not that of two machines: what is shown is what goes over
-the network, what a node costs that dies, and that a run goes on. Needs the extras `cluster` and `robotics`.
+Both nodes are on this machine, so the speed is not that of two machines. The benchmark shows how much is
+sent over the network, how many frames are lost with a node, and that the run continues. Needs the extras
+`cluster` and `robotics`.
 """
 
 from __future__ import annotations
@@ -26,12 +27,12 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl_her_recipes import Components, build, make_recipe
 from torchrl_her_recipes.components.collection.cluster import join, resource
 
-BATCHES = 30  # of a piece
+BATCHES = 30  # number of batches in each phase of the run
 PIECES = ("two nodes", "one has died", "another one has come")
 
 
 def size(entries: TensorDictBase) -> int:
-    """Bytes that are sent."""
+    """Returns the number of bytes that are sent for some entries."""
     return sum(entry.nbytes for entry in entries.values(True, True) if isinstance(entry, torch.Tensor))
 
 
@@ -41,7 +42,7 @@ def wait_for_cores(count: int) -> None:
 
 
 def pieces(cluster: Cluster, nodes: Sequence[Node], components: Components) -> tuple[list[list[str]], str]:
-    """A row for each piece of the run, and what is sent."""
+    """Returns a row of the table for each phase of the run, and a text about the amount of sent data."""
     trainer, buffer = components.trainer(), components.buffer
     trainer.run(trainer.warmup_frames)
     rows = []
@@ -88,7 +89,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     torch.set_num_threads(1)
-    ray_constants.ENABLE_RAY_CLUSTER = False  # nodes listen on the loopback alone
+    ray_constants.ENABLE_RAY_CLUSTER = False  # nodes listen on the loopback interface only
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
     nodes = [cluster.add_node(num_cpus=1) for _ in range(2)]

@@ -1,10 +1,10 @@
-"""Frames/s with a process that collects beside the learner, beside one process that does both in turn.
+"""Compares frames/s of a learner with a collecting process, and of one process that does both in turn.
 
     python benchmarks/run.py parallel.processes
 
-First one process alone tells how long collecting and learning take for each frame. From that follow the
-number of frames for each gradient step at which both take equally long, and the most that a second process
-can give: the sum of both times over the longer one. Then the loops take turns.
+First, a single process measures how long collecting and learning take per frame. From these times follow the
+number of frames for each gradient step at which both take equally long, and the largest possible speedup by
+a second process: the sum of both times, divided by the longer time. Then the loops are timed in turns.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from torchrl_her.trainers.trainer import Trainer
 from torchrl_her_recipes import Components, Recipe, build, load_preset, make_recipe
 
 PRESET = Path(__file__).parents[1] / "presets" / "fetch_push.yaml"
-BATCHES = 50  # of a timed piece: an epoch of the preset, whose first batch the learner waits for
+BATCHES = 50  # batches in a timed call: an epoch of the preset; the learner waits for the first batch
 KINDS: dict[str, dict[str, Any]] = {
     "one process": {},
     "one collects, sync": {"processes": 1},
@@ -36,7 +36,7 @@ KINDS: dict[str, dict[str, Any]] = {
 
 @dataclass
 class Shares:
-    """Seconds for each frame: of collecting, of writing, and of learning from it."""
+    """Seconds per frame for collecting, for writing to the buffer, and for learning."""
 
     collect: float
     write: float
@@ -45,34 +45,34 @@ class Shares:
 
     @property
     def most(self) -> float:
-        """What a second process can give at most."""
+        """Largest possible speedup by a second process."""
         other = self.write + self.learn
         return (self.collect + other) / max(self.collect, other)
 
     def balanced(self) -> float:
-        """The frames for each gradient step at which collecting takes as long as everything else."""
+        """Returns the frames per gradient step at which collecting takes as long as writing and learning."""
         update = self.learn * self.frames_per_update
         return max(round(update / (self.collect - self.write), 2), 0.05)
 
 
 class Loop:
-    """A training loop that goes on with each call."""
+    """A training loop; each call continues it."""
 
     def __init__(self, recipe: Recipe) -> None:
         self.components: Components = build(recipe)
         self.trainer: Trainer = self.components.trainer()
         config = recipe.collection
         self.frames = BATCHES * config.num_envs * config.steps_per_batch
-        self.trainer.run(config.warmup_frames + self.frames // 10)  # the memory is there then
+        self.trainer.run(config.warmup_frames + self.frames // 10)  # first writes allocate memory
 
     def __call__(self) -> float:
-        """Frames/s of a timed piece."""
+        """Trains for ``BATCHES`` batches, and returns frames/s."""
         began = time.perf_counter()
         self.trainer.run(self.frames)
         return self.frames / (time.perf_counter() - began)
 
     def shares(self) -> Shares:
-        """What takes how long, where one process does everything."""
+        """Measures how long collecting, writing and learning take in a single process."""
         trainer, seconds = self.trainer, {"collect": 0.0, "learn": 0.0}
         with (
             _timed(trainer.collector, "next", seconds, "collect"),
@@ -99,7 +99,7 @@ def _timed(owner: Any, name: str, seconds: dict[str, float], key: str) -> Iterat
 
 
 def compare(recipe: Recipe, repeats: int) -> tuple[Shares, dict[str, list[float]]]:
-    """The shares of one process, and frames/s of each loop, taken in turns."""
+    """Returns the times per frame in one process, and frames/s of each kind of loop, timed in turns."""
     loops = {name: Loop(recipe.replace(**options)) for name, options in KINDS.items()}
     shares = loops["one process"].shares()
     rates: dict[str, list[float]] = {name: [] for name in loops}

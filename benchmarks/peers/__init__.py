@@ -1,1 +1,1 @@
-"""What the benchmarks of training compare: a module for each library, with the interface of :mod:`.peer`."""
+"""Libraries that benchmarks of training compare: a module for each, with the interface of :mod:`.peer`."""

@@ -1,4 +1,4 @@
-"""What Stable-Baselines3 and SBX, which is built upon it, have in common: environments, options, the loop."""
+"""Environments, options and training loop that Stable-Baselines3 and SBX, which builds on it, share."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from torchrl_her_envs import TASKS, get_task
 from torchrl_her_envs.registry import GYM
 from torchrl_her_recipes import Recipe
 
-NEVER = 1 << 60  # frames or episodes: more than any benchmark plays
+NEVER = 1 << 60  # number of frames or episodes that no benchmark reaches
 
 
 class RelabelingEnv(PeerEnv):
-    """The peer environment with the reward function that Stable-Baselines3 relabels with."""
+    """The ordinary environment, with the reward function by which Stable-Baselines3 relabels."""
 
     def compute_reward(self, achieved: np.ndarray, desired: np.ndarray, _info: object) -> np.ndarray:
         gap = np.square(achieved - desired).sum(-1)
@@ -27,7 +27,7 @@ class RelabelingEnv(PeerEnv):
 
 
 def make_envs(recipe: Recipe) -> DummyVecEnv:
-    """As many environments of the task as in the recipe, in the leanest ordinary form that there is of it."""
+    """Makes the recipe's number of environments of its task, in the form with the least overhead."""
 
     def make() -> gymnasium.Env:
         if recipe.task.name in TASKS:
@@ -38,7 +38,7 @@ def make_envs(recipe: Recipe) -> DummyVecEnv:
 
 
 def options(recipe: Recipe) -> dict[str, Any]:
-    """The recipe's networks, batches, discount, target updates and hindsight, as both libraries name them."""
+    """Returns the recipe's networks, batches, discount, target updates and HER as both libraries' options."""
     return {
         "policy": "MultiInputPolicy",
         "replay_buffer_class": HerReplayBuffer,
@@ -49,34 +49,34 @@ def options(recipe: Recipe) -> dict[str, Any]:
         "learning_rate": recipe.learner.learning_rate,
         "buffer_size": recipe.replay.buffer_size // (recipe.hindsight.k + 1),  # real transitions only
         "batch_size": recipe.replay.batch_size,
-        "seed": recipe.run.seed,  # of the environments, too
+        "seed": recipe.run.seed,  # also seeds the environments
         "device": "cpu",
     }
 
 
 def steps_each(recipe: Recipe) -> int:
-    """Gradient steps for a step of all environments: whole ones, rounded down, and at least one."""
+    """Returns the number of gradient steps per step of all environments, rounded down, but at least 1."""
     return max(1, int(recipe.collection.num_envs / recipe.collection.frames_per_update))
 
 
 def rounds(recipe: Recipe) -> dict[str, Any]:
-    """The recipe's environment steps between two rounds of gradient steps, and gradient steps in a round.
+    """Returns the environment steps between two rounds of gradient steps, and gradient steps in a round.
 
     Raises:
-        ValueError: the recipe's are not whole, as they must be here.
+        ValueError: the recipe's gradient steps in a round are not a whole number.
     """
     collection = recipe.collection
     steps = collection.num_envs * collection.steps_per_batch / collection.frames_per_update
     if steps != int(steps) or steps < 1:
-        raise ValueError(f"there must be a whole number of gradient steps in a round, got {steps}")
+        raise ValueError(f"gradient steps in a round must be a whole number, got {steps}")
     return {"train_freq": (collection.steps_per_batch, "step"), "gradient_steps": int(steps)}
 
 
 class Baseline:
-    """The peer's interface over a model of either library.
+    """Interface :class:`Peer` for a model of Stable-Baselines3 or SBX.
 
     Args:
-        recipe: what to be like.
+        recipe: recipe whose options the model gets.
     """
 
     algorithm: ClassVar[type[OffPolicyAlgorithm]]
@@ -107,4 +107,4 @@ class Baseline:
         return self.model.num_timesteps - before
 
     def wait(self) -> None:
-        """Until everything that was begun has been computed."""
+        """Waits until all computations that were started are done."""

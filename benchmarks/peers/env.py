@@ -1,9 +1,9 @@
-"""The peer of ``env_speed.py``: the hand's throwing tasks as an ordinary gymnasium environment.
+"""The "peer" of ``env_speed.py``: the hand's throwing tasks as an ordinary gymnasium environment.
 
-One world, one pymunk space, plain Python: what one would write without batching in mind. It follows the same
-rules as ``torchrl_her_envs``, and takes its constants from there, so that both can be held against each other
-step by step; no code is shared. Where being ordinary is cheaper, it is ordinary: a held ball is carried along
-without simulating anything, and Chipmunk finds and remembers contacts in its default way.
+One pymunk space and plain Python, as one would write it without batching. It follows the same rules as
+``torchrl_her_envs`` and takes its constants from there, so that both can be compared step by step, but no
+code is shared. The cheaper way is chosen: a held ball moves along without simulation, and Chipmunk finds and
+remembers contacts in its default way.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from torchrl_her_envs import Task, WorldConfig
 Observation = dict[str, Any]  # arrays
 Point = tuple[float, float]
 
-BORDER = 0.5  # meters: half the thickness of the screen's sides
+BORDER = 0.5  # half the thickness of the screen's sides, in meters
 SLOP = 1e-3  # meters that a ball may sink into a surface
-PARKED = (1.0, 3.0)  # meters: where a ball touches nothing
+PARKED = (1.0, 3.0)  # position in meters at which a ball touches nothing
 
 
 class PeerEnv(gymnasium.Env[Observation, np.ndarray]):
@@ -31,12 +31,12 @@ class PeerEnv(gymnasium.Env[Observation, np.ndarray]):
     Args:
         task: a throwing task of the hand.
         world: the constants of the world.
-        dtype: of observations.
-        exact: for comparing paths only, as it costs time: contacts are found in the order in which the
-            batched environment finds them, which decides corners, and are forgotten after each step.
+        dtype: type of observations.
+        exact: whether contacts are found in the batched environment's order, which matters at corners, and
+            are forgotten after each step. This is slow, so only comparisons of paths use it.
 
     Raises:
-        ValueError: any other task.
+        ValueError: the task is not a throwing task of the hand.
     """
 
     def __init__(
@@ -48,7 +48,7 @@ class PeerEnv(gymnasium.Env[Observation, np.ndarray]):
         exact: bool = False,
     ) -> None:
         if task.effector != "hand" or not task.throws:
-            raise ValueError(f"the peer knows the hand's throwing tasks, got {task.name!r}")
+            raise ValueError(f"task must be a throwing task of the hand, got {task.name!r}")
         self.task = task
         self.world = world or WorldConfig()
         self.dtype = dtype
@@ -96,7 +96,7 @@ class PeerEnv(gymnasium.Env[Observation, np.ndarray]):
         closed = grip > 0.0
         if self._held and not closed:
             self._held = False
-            self._ball.velocity = self._hand_velocity  # of the step before
+            self._ball.velocity = self._hand_velocity  # velocity in the step before
         self._move_hand(x, y)
         if not self._held:
             self._fly()
@@ -115,7 +115,7 @@ class PeerEnv(gymnasium.Env[Observation, np.ndarray]):
     def place(
         self, *, hand: Point, hand_velocity: Point, ball: Point, ball_velocity: Point, goal: Point, held: bool
     ) -> None:
-        """Puts the world into a state, at the start of an episode; meters, but the goal as it is shown."""
+        """Starts an episode in a given state, in meters, with a goal in observed coordinates."""
         self._hand, self._hand_velocity, self._goal = hand, hand_velocity, goal
         self._held = self._closed = held
         self._ball.position, self._ball.velocity = ball, ball_velocity

@@ -1,4 +1,4 @@
-"""This project, and TorchRL's own pieces in this project's loop."""
+"""This project's learners, and TorchRL's own loss and buffer in this project's training loop."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torchrl_her_recipes import Recipe, build
 
 
 class Ours:
-    """Our trainer, as ``torchrl-her train`` makes it of a recipe."""
+    """This project's trainer with DDPG, as ``torchrl-her train`` makes it from a recipe."""
 
     name: ClassVar[str] = "this, DDPG"
     differs: ClassVar[str] = (
@@ -29,13 +29,13 @@ class Ours:
     def updates(self) -> int:
         return self.trainer.updates
 
-    # Users ask a trainer for epochs or frames, never for gradient steps alone: hence two private names.
+    # A trainer has no public method for gradient steps alone, so two private names are used.
 
     def fill(self, frames: int) -> None:
         self.trainer.warmup_frames = math.inf
         self.trainer.run(frames)
         self.trainer.warmup_frames = 0
-        self.trainer._credit = 0.0  # the steps that belong to these frames are left out
+        self.trainer._credit = 0.0  # skips the gradient steps that these frames would earn
 
     def gradient_steps(self, steps: int) -> int:
         before = self.updates
@@ -50,7 +50,7 @@ class Ours:
 
 
 class OursHalf(Ours):
-    """The same with products of shorter numbers."""
+    """This project's trainer with DDPG and matrix products in bfloat16."""
 
     name: ClassVar[str] = "this, DDPG, bfloat16"
     differs: ClassVar[str] = (
@@ -62,7 +62,7 @@ class OursHalf(Ours):
 
 
 class OursTD3(Ours):
-    """The same with TD3."""
+    """This project's trainer with TD3."""
 
     name: ClassVar[str] = "this, TD3"
     differs: ClassVar[str] = "as our DDPG, with two critics and smoothed targets."
@@ -72,7 +72,7 @@ class OursTD3(Ours):
 
 
 class OursSAC(Ours):
-    """The same with SAC."""
+    """This project's trainer with SAC."""
 
     name: ClassVar[str] = "this, SAC"
     differs: ClassVar[str] = "as our TD3, with a stochastic actor and a learned temperature."
@@ -82,7 +82,7 @@ class OursSAC(Ours):
 
 
 class TorchRLPieces(Ours):
-    """TorchRL's loss module, autograd, optimizer and buffer, one draw for each gradient step."""
+    """TorchRL's loss module, autograd, optimizer and buffer; samples the buffer for each gradient step."""
 
     name: ClassVar[str] = "TorchRL's loss and buffer"
     differs: ClassVar[str] = (

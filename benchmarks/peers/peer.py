@@ -1,4 +1,4 @@
-"""What a library has to do in order to be measured."""
+"""The interface of libraries that benchmarks compare."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from torchrl_her_recipes import Recipe
 
 
 class Peer(Protocol):
-    """A library that trains what a recipe describes.
+    """A library that trains an agent with the options of a recipe.
 
     Attributes:
-        name: of the library and its algorithm, as tables show it.
-        differs: what it does otherwise than our DDPG, for the text beside the tables.
+        name: name of the library and its algorithm in tables.
+        differs: differences from this project's DDPG, for the text below the tables.
     """
 
     name: ClassVar[str]
@@ -22,21 +22,21 @@ class Peer(Protocol):
 
     @property
     def updates(self) -> int:
-        """Gradient steps so far."""
+        """Number of gradient steps so far."""
         ...
 
     def fill(self, frames: int) -> None:
-        """Plays that many environment steps into the replay buffer, without learning."""
+        """Collects ``frames`` environment steps into the replay buffer, without learning."""
         ...
 
     def gradient_steps(self, steps: int) -> int:
-        """Makes that many gradient steps with all that belongs to them; returns how many it made.
+        """Takes ``steps`` complete gradient steps; returns the number of steps that it took.
 
-        What belongs to them: drawing transitions, relabeling those that are relabeled when they are drawn,
-        targets, losses, the optimizer, target networks, and priorities where there are any.
+        They include sampling transitions, relabeling if it is done when sampling, targets, losses, the
+        optimizer, target networks, and priorities if there are any.
         """
         ...
 
     def loop(self, frames: int) -> int:
-        """Trains: plays, stores and learns; returns the environment steps."""
+        """Collects ``frames`` environment steps, stores them and learns; returns the number of steps."""
         ...

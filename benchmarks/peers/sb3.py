@@ -1,4 +1,4 @@
-"""Stable-Baselines3 with its HER."""
+"""DDPG and TD3 of Stable-Baselines3, with its HER."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from torchrl_her_recipes import Recipe
 
 
 class SB3DDPG(Baseline):
-    """Its DDPG."""
+    """DDPG of Stable-Baselines3."""
 
     name: ClassVar[str] = "Stable-Baselines3, DDPG"
     differs: ClassVar[str] = (
@@ -25,7 +25,7 @@ class SB3DDPG(Baseline):
 
 
 class SB3TD3(Baseline):
-    """Its TD3."""
+    """TD3 of Stable-Baselines3."""
 
     name: ClassVar[str] = "Stable-Baselines3, TD3"
     differs: ClassVar[str] = (
@@ -36,13 +36,13 @@ class SB3TD3(Baseline):
 
 
 def make_sb3(recipe: Recipe, *, noise: float = 0.0) -> DDPG:
-    """A model that trains as the recipe says, in as many environments, for comparing what is learned.
+    """Makes DDPG with the options and the number of environments of a recipe, to compare success.
 
-    It keeps real rows only, relabels while it samples, and has no prioritized replay.
+    It stores real rows only, relabels while it samples, and has no prioritized replay.
 
     Args:
-        recipe: what to be like.
-        noise: standard deviation of what is added to actions.
+        recipe: recipe whose options the model gets.
+        noise: standard deviation of the noise on actions.
     """
     envs = make_envs(recipe)
     actions = envs.action_space.shape

@@ -1,4 +1,4 @@
-"""SBX's SAC, the JAX twin of Stable-Baselines3's, with the HER of Stable-Baselines3."""
+"""SAC of SBX (Stable-Baselines in JAX), with the HER of Stable-Baselines3."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from sbx import SAC
 from peers.baselines import make_envs, options, steps_each
 from torchrl_her_recipes import Recipe
 
-ENTROPY = 0.05  # what the return of a step is worth beside its entropy: the fixed one that does best on Push
+ENTROPY = 0.05  # entropy coefficient (weight of entropy beside reward): the best fixed value on FetchPush
 
 
 def make_sac(recipe: Recipe) -> SAC:
-    """A model that trains as the recipe says, in as many environments, for comparing what is learned.
+    """Makes SAC with the options and the number of environments of a recipe, to compare success.
 
-    It keeps real rows only, relabels while it samples, and has no prioritized replay.
+    It stores real rows only, relabels while it samples, and has no prioritized replay.
 
     Args:
-        recipe: what to be like.
+        recipe: recipe whose options the model gets.
     """
     return SAC(
         env=make_envs(recipe),

@@ -1,4 +1,4 @@
-"""SBX, Stable-Baselines Jax, with the HER of Stable-Baselines3."""
+"""TD3 of SBX (Stable-Baselines in JAX), with the HER of Stable-Baselines3."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from peers.baselines import Baseline
 
 
 class SBXTD3(Baseline):
-    """Its TD3: its DDPG takes no observations with goals."""
+    """TD3 of SBX, whose DDPG does not support observations with goals."""
 
     name: ClassVar[str] = "SBX, TD3"
     differs: ClassVar[str] = (

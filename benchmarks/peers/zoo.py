@@ -1,6 +1,6 @@
 """Agents of Stable-Baselines3 and SBX with HER and the options of the RL Zoo for the Fetch tasks.
 
-The options are those of its ``hyperparams/tqc.yml``, also for SAC, for which it has none of today.
+The options are those of the Zoo's ``hyperparams/tqc.yml``, also for SAC, for which it has no current ones.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ def make_zoo(algorithm: str, recipe: Recipe) -> OffPolicyAlgorithm:
 
     Args:
         algorithm: TQC or SAC of Stable-Baselines3, or SBX-TQC.
-        recipe: only its task and its seed count.
+        recipe: recipe whose task and seed are used; other options have no effect.
     """
     options: dict[str, Any] = {
         "policy": "MultiInputPolicy",

@@ -110,7 +110,7 @@ def test_sbx() -> None:
 def test_rounds_have_whole_gradient_steps() -> None:
     baselines = import_module("peers.baselines")
     assert baselines.rounds(recipe()) == {"train_freq": (10, "step"), "gradient_steps": 10}
-    with pytest.raises(ValueError, match=r"whole number of gradient steps in a round, got 13\.3"):
+    with pytest.raises(ValueError, match=r"gradient steps in a round must be a whole number, got 13\.3"):
         baselines.rounds(recipe(frames_per_update=3))
 
 
