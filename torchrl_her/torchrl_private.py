@@ -1,6 +1,6 @@
 """Access to private attributes of TorchRL's and tensordict's objects, all in one place.
 
-All of them were seen in TorchRL 0.14.0, 0.14.1 and the nightly build of 2026-10-27, and in tensordict 0.14.2,
+All of them exist in TorchRL 0.14.0, 0.14.1 and the nightly build of 2026-10-27, and in tensordict 0.14.2,
 0.14.3 and 0.15.3. Subclasses elsewhere also use private attributes that they inherit.
 """
 

@@ -228,7 +228,7 @@ class BehaviorGoals(Transform):
         before = self._get(next_tensordict, self.keys.reward)
         ended = self._get(next_tensordict, self.keys.terminated)
         fell = ended & (before < self.achieved_reward)
-        if bool(fell.any()):  # an end without success, such as a fall, ends it for any goal
+        if bool(fell.any()):  # a failure, such as a fall, ends the episode for any goal
             own_reward, own_end = call_reward(self.reward_fn, outcome, real)
             fell = fell & ~own_end
             reward = reward + (before - own_reward).clamp(max=0.0) * fell  # the cost of the fall

@@ -99,14 +99,14 @@ class _StageTransform(Transform):
         return differs
 
     def _get(self, tensordict: TensorDictBase, key: NestedKey, width: int) -> Tensor:
-        """Returns an entry; raises if it is missing or has another width."""
+        """Returns an entry; raises an error if it is missing or does not have the given width."""
         entry = entry_of(tensordict, key, by=type(self).__name__)
         if entry.shape[-1] != width:
             raise ValueError(f"the curriculum needs {key!r} of width {width}, got {entry.shape[-1]}")
         return entry
 
     def _seen(self, spec: Composite, key: NestedKey, width: int) -> TensorSpec:
-        """Returns the spec of an entry; raises if it is missing or has another width."""
+        """Returns the spec of an entry; raises an error if it is missing or has another width."""
         if key not in spec.keys(True, True):
             raise KeyError(
                 f"{type(self).__name__} needs the observation {key!r}, got {list(spec.keys(True, True))}"

@@ -1,4 +1,4 @@
-"""Transitions of one stage of a curriculum, shown as another stage would have shown them."""
+"""Converts transitions to the observations, goals, rewards and ends of another curriculum stage."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Batches of a run's own transitions and of demonstrations."""
+"""Batches that mix a run's own transitions with demonstrations."""
 
 from __future__ import annotations
 

@@ -75,7 +75,7 @@ def read_tensors(path: str | Path) -> Any:
 
 
 def load_tensors(file: BinaryIO, *, map_location: torch.device | str = "cpu") -> Any:
-    """Returns what ``torch.save`` wrote from the position of an open file to its end.
+    """Returns the data that ``torch.save`` wrote, read from the position of an open file to its end.
 
     Args:
         file: Open file that can be read at any position.

@@ -1,4 +1,4 @@
-"""The state of a part of a replay buffer as a file in a folder, as TorchRL's buffers write and read it."""
+"""Saves a part of a replay buffer as a file in a folder, with the methods that TorchRL's buffers call."""
 
 from __future__ import annotations
 

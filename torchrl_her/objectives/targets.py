@@ -22,10 +22,10 @@ class ClampedTD0(TD0Estimator):
     With rewards in [-1, 0], for example, no value is below -1 / (1 - gamma) or above 0. Andrychowicz et al.,
     Hindsight Experience Replay, 2017, appendix A.
 
-    A row may span several steps: its reward is then the discounted sum of their rewards, its ``next`` is the
-    one of the last step, and the entry ``steps_to_next_obs`` [B, 1], int64, is their number. The next state's
-    value is discounted by ``gamma ** steps_to_next_obs``. Without the entry each row is one step. The bounds
-    are the same in both cases, since the value of a state does not depend on how it is estimated.
+    A row may span several steps: its reward is then the discounted sum of the steps' rewards, its ``next`` is
+    that of the last step, and its entry ``steps_to_next_obs`` [B, 1], int64, is the number of steps. The
+    value of the next state is discounted by ``gamma ** steps_to_next_obs``. Without it, a row is one step.
+    The bounds are the same in both cases, since a state's value does not depend on how it is estimated.
 
     Args:
         low: least target.
@@ -92,7 +92,7 @@ class _BuffersToo(TargetNetUpdater):
 
     @cached_property
     def _buffers(self) -> dict[str, list[Any]]:
-        """Returns the keys of buffers, by the names of the online networks that have some."""
+        """Returns the keys of the buffers of each online network that has some, by its name."""
         found = {
             name: [
                 key

@@ -23,8 +23,8 @@ class PenalizedTD3Loss(TD3Loss):
     """TorchRL's TD3 loss with further terms in its actor's loss, and separate random numbers for each run.
 
     Targets use the least value of all critics, or of some that are drawn at random in each gradient step, as
-    in REDQ (Chen et al., 2021). In the second case the actor follows the mean of all critics instead of the
-    first one.
+    in REDQ (Chen et al., 2021). With such a subset, the actor follows the mean of all critics; otherwise
+    it follows the first critic.
 
     Args:
         *args: arguments of :class:`torchrl.objectives.TD3Loss`.

@@ -1,4 +1,4 @@
-"""Relabeling while sampling: only real transitions are stored, and those that are drawn get other goals.
+"""Relabeling while sampling: only real transitions are stored; some of those drawn get other goals.
 
 It draws goals by the same factors as the writer (:class:`~torchrl_her.HERWriter`). Prefer it if the buffer
 must stay small (a fifth of the transitions), if goals should be drawn anew each time, or if the storage
@@ -62,7 +62,7 @@ from torchrl_her.torchrl_private import (
 
 
 class _Stored(NamedTuple):
-    """Entries that were read from a storage, and the state that it was in then."""
+    """Entries that were read from a storage, with the state of the storage at that time."""
 
     storage: Storage
     state: tuple[int, int]
@@ -78,7 +78,7 @@ class _Chosen(NamedTuple):
     """The virtual goals that were chosen for a batch, and what else is needed to relabel it."""
 
     shape: torch.Size  # shape of the batch
-    rows: Tensor  # [V], places in the flat batch
+    rows: Tensor  # [V], positions in the flat batch
     goals: Tensor  # [V, g]
     ends: Tensor | None  # [B, 1] of bool, where a sampler of slices ends a slice
     ahead: tuple[TensorDictBase, NStepReturn] | None  # with n steps: ``next`` of the last step, and returns

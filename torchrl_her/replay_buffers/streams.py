@@ -71,7 +71,7 @@ def broken(
     held: int,
     resumed: bool,
 ) -> Tensor:
-    """Returns a mask [n] of transitions that are the last of their episode although they are not done.
+    """Returns a mask [n] of transitions that end an episode although they are not done.
 
     Another episode's transition follows them in the same stream: an environment was reset from outside, or
     another collector uses the same ids again.

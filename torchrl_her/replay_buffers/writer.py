@@ -294,7 +294,7 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
     def extend_run(self, data: TensorDictBase, run: int = 0) -> Tensor:
         """Writes whole episodes of one of several runs, which its environments did not collect.
 
-        Open episodes that are held back wait as before, in all runs.
+        Open episodes that are held back are not ended by this, in any run.
 
         Args:
             data: [n], one episode after the other, as if of one environment; the last transition is done.
@@ -447,7 +447,7 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
         return places.rows(self._rings.cursors, self.capacity)[held:], left, recent
 
     def _settings(self) -> list[Hashable]:
-        """Returns settings of each run that must be equal in runs that are written at once."""
+        """Returns the settings of each run; only runs with equal settings are written at once."""
         is_uniform = [weights.is_uniform for weights in self.goal_weights] or [True] * self.runs
         return [(id(self.reward_of(run)), is_uniform[run], self._times(run)) for run in range(self.runs)]
 
@@ -479,7 +479,7 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
     def _commit(self, drafts: list[_Draft], places: Places) -> None:
         """Stores and counts real and virtual transitions, and notes where the real ones went.
 
-        If a batch does not fit into the buffer, virtual ones, which are written first, are overwritten. A
+        If a batch does not fit into the buffer, its virtual transitions, which come first, are overwritten. A
         user's functions are called first: if one raises an error, nothing of the batch is stored or counted.
         """
         exclude = [*self._exclude, *in_root_and_next([self._keys.env_ids])]

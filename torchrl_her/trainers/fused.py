@@ -157,7 +157,7 @@ class FusedLearner:
         return losses
 
     def _adam(self, steps: int, counts: Sequence[float]) -> Any:
-        """Returns what Adam's next S steps of each run need, [R, S], such as bias corrections."""
+        """Returns the numbers [R, S] of Adam's next S steps of each run, such as bias corrections."""
         (group,) = self.optimizer.param_groups
         rate, (beta1, beta2), kind = float(group["lr"]), group["betas"], self._kinds.adam
 

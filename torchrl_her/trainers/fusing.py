@@ -170,7 +170,7 @@ def network_of(module: nn.Module) -> nn.Module:
 
 
 def layers_of(net: nn.Module) -> list[Layer] | None:
-    """Returns the layers of one of this library's networks, from its input on; None if it has others.
+    """Returns the layers of one of this library's networks, from its input on; None if it has other ones.
 
     The tensors of the layers, in the same order, are those of ``net.state_dict()``: weight and bias, then
     scale and shift of a normalization, and the running mean and variance of a batch normalization.

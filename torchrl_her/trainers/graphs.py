@@ -155,7 +155,7 @@ class _Recorded:
             return self._out.clone()
 
     def _call_on_another_stream(self, rows: TensorDictBase) -> TensorDictBase:
-        """Warms up as CUDA requires before a recording."""
+        """Makes a call on a side stream, as CUDA requires before a recording."""
         stream = torch.cuda.Stream(self._device)
         stream.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(stream), _uncaptured():

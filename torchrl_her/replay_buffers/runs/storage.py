@@ -211,7 +211,7 @@ def unpack(packed: Tensor, fields: Sequence[Field]) -> TensorDict:
 
 
 def _tensordict(source: dict[Any, Any], shape: torch.Size, device: torch.device) -> TensorDict:
-    """Makes a tensordict of tensors that fit, without checks, which would take most of the time."""
+    """Makes a tensordict of tensors of the right shape without checks, which take most of the time."""
     entries = {
         key: _tensordict(entry, shape, device) if isinstance(entry, dict) else entry
         for key, entry in source.items()
