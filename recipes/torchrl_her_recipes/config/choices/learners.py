@@ -228,7 +228,7 @@ class REDQConfig(SACConfig):
 @LEARNERS.register
 @dataclass(frozen=True, kw_only=True)
 class TQCConfig(EntropyConfig):
-    """SAC with quantile critics; targets leave out the greatest quantiles (Kuznetsov et al., 2020)."""
+    """SAC with quantiles; targets omit the greatest quantiles (Kuznetsov et al., 2020)."""
 
     name = "tqc"
     maker = f"{_MAKERS}:TQCBuilder"

@@ -65,7 +65,7 @@ class AllAtOnce(_ByEpisode):
 @ORDER.register
 @dataclass(frozen=True, kw_only=True)
 class Teacher(_ByEpisode):
-    """Draws each episode's stage; more often a stage whose success changes (Matiisen et al., 2017)."""
+    """Draws stages of episodes, mostly those whose success changes (Matiisen et al., 2017)."""
 
     name = "teacher_student"
     maker = f"{_MAKERS}:make_teacher"

@@ -39,7 +39,7 @@ class Equal(Weights):
 
 @dataclass(frozen=True, kw_only=True)
 class SequentialIBS(Equal):
-    """Goals that the task often has: weights q* instead of q* - q; for prioritized replay."""
+    """Goals that the task often has: weights q*, not q* - q; for prioritized replay."""
 
     name = "ibs_sequential"
     maker = f"{_MAKERS}:make_instructive"
