@@ -7,11 +7,11 @@ from __future__ import annotations
 
 from typing import Any
 
-import gymnasium
 from sb3_contrib import TQC
 from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
+from torchrl_her_envs.gym.check import make_one
 from torchrl_her_envs.registry import GYM
 from torchrl_her_recipes import Recipe
 
@@ -24,11 +24,16 @@ def make_zoo(algorithm: str, recipe: Recipe) -> OffPolicyAlgorithm:
     Args:
         algorithm: TQC or SAC of Stable-Baselines3, or SBX-TQC.
         recipe: recipe whose task and seed are used; other options have no effect.
+
+    Raises:
+        ValueError: the task is none of those whose options are known here.
     """
+    if (name := recipe.task.name) not in _BATCHES:
+        raise ValueError(f"the RL Zoo's options are known here for {', '.join(_BATCHES)}, not for {name}")
     options: dict[str, Any] = {
         "policy": "MultiInputPolicy",
-        "env": gymnasium.make(recipe.task.name.removeprefix(GYM)),
-        "batch_size": _BATCHES[recipe.task.name],
+        "env": make_one(name.removeprefix(GYM), None, {}),
+        "batch_size": _BATCHES[name],
         "buffer_size": 1_000_000,
         "gamma": 0.95,
         "learning_rate": 1e-3,
