@@ -74,8 +74,9 @@ class DemonstrationStarts(Transform):
             raise ValueError(f"share must be in [0, 1], got {share}")
         single = isinstance(demonstrations, Demonstrations)
         per_run = [demonstrations] * runs if isinstance(demonstrations, Demonstrations) else demonstrations
-        if len(per_run) != runs or (generators is not None and len(generators) != runs):
-            raise ValueError(f"{runs} runs need {runs} demonstrations and generators, got {len(per_run)}")
+        for name, given in (("demonstrations", per_run), ("generators", generators)):
+            if given is not None and len(given) != runs:
+                raise ValueError(f"runs={runs} needs as many {name}, got {len(given)}")
         first = usable(per_run[0])
         self._shown = [first if single else usable(demos) for demos in per_run]
         self.share, self.runs = share, runs

@@ -206,7 +206,8 @@ def test_it_goes_on_from_its_state(tmp_path: Any) -> None:
     [
         (SHOWN, {"share": 1.5}, r"share must be in \[0, 1\], got 1.5"),
         (SHOWN, {"width": 0}, "width must be at least 1, got 0"),
-        ([SHOWN], {"runs": 2}, "2 runs need 2 demonstrations and generators, got 1"),
+        ([SHOWN], {"runs": 2}, "runs=2 needs as many demonstrations, got 1"),
+        (SHOWN, {"runs": 2, "generators": [None]}, "runs=2 needs as many generators, got 1"),
         (walks(3, states=False), {}, "demonstrations of walk hold no physical states that episodes could"),
         (walks(3, 4, goal=77.0), {}, "none of 2 demonstrations of walk achieves its goal"),
     ],
