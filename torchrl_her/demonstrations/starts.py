@@ -86,7 +86,7 @@ class DemonstrationStarts(Transform):
         self._asks_elsewhere = False
 
     def show(self, demonstrations: Demonstrations, *, run: int = 0) -> None:
-        """Replaces a run's demonstrations, as for a new stage, and moves its starts near the end again."""
+        """Gives a run other demonstrations, for example for a new stage; starts are near their ends again."""
         self._shown[run] = usable(demonstrations)
         self.walk.restart(run, int(self._shown[run].lengths.max()))
 

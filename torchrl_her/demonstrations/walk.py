@@ -69,7 +69,7 @@ class WalkBack:
             self._outcomes[run] = latest
 
     def restart(self, run: int, longest: int) -> None:
-        """Moves a run's starts near the end again, for other demonstrations."""
+        """Moves a run's starts near the end of the demonstrations again, as for a new set of them."""
         self._longest[run], self.back[run], self._outcomes[run] = longest, min(self.width, longest), []
 
     def state_dict(self) -> dict[str, Any]:

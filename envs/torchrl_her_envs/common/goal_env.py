@@ -68,7 +68,7 @@ class GoalEnv(EnvBase):
     def goal_sigma(self) -> float:
         """The final sigma of IBS, as a share of the width of the goals' box.
 
-        Goals within about this distance of one of the task's goals help in learning it.
+        Practice at one goal also helps at the task's goals within about this distance.
         """
         return 0.2
 

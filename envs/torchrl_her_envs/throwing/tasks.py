@@ -57,8 +57,8 @@ class WorldConfig:
     max_steps: int = 50  # number of actions in an episode, which takes 2 s
     hand_speed: float = 8.0  # greatest speed in each direction: enough to throw across the screen
     joint_speed: float = 4.0  # greatest speed of each joint in rad/s
-    ball_radius: float = 0.03  # screen; also the distance below which a hand catches or reaches a ball
-    hole_radius: float = 0.05  # screen; also the distance below which a ball is at the goal
+    ball_radius: float = 0.03  # of the screen; also the distance below which a hand catches or reaches a ball
+    hole_radius: float = 0.05  # of the screen; also the distance below which a ball is at the goal
     hand_goals: tuple[float, float, float, float] = (0.55, 0.2, 0.95, 0.8)  # screen: left, bottom, right, top
     arm_goals: tuple[float, float, float, float] = (0.72, 0.2, 0.95, 0.8)  # screen: beyond the arm's reach
     wall_x: float = 0.5  # screen: x of the wall's middle

@@ -145,7 +145,7 @@ class Study:
                 raise ValueError(f"{field} of {self.name} must not set {both[0]} in {name}, since it varies")
 
     def combinations(self) -> Iterator[dict[str, Any]]:
-        """Yields the varied options and the case of each combination, in the order of :meth:`cells`."""
+        """Yields each combination: values of the options that vary, and a case's name if there are any."""
         for values in product(*self.vary.values()):
             varied = dict(zip(self.vary, values, strict=True))
             yield from ({**varied, "case": case} for case in self.cases) if self.cases else (varied,)

@@ -300,7 +300,7 @@ def export_policy(
     policy = Policy.load(source, run=run, best=best)
     info = replace(policy.info, task=task or policy.info.task, versions=present_versions())
     if task is not None:
-        permit_task(task)  # the caller names this task, and not just a file
+        permit_task(task)  # its module may be imported, since the caller named this task
         with closing(TaskEnvs.of(policy.recipe.replace(task=task)).make(1, [0], scaled=False)) as env:
             policy.info.check_plays(env, task)
     measured = info.task == policy.info.task and not math.isnan(info.success)

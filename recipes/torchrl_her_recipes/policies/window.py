@@ -71,7 +71,7 @@ def play(
 
 def show(viewing: Viewing, window: KeyWindow) -> None:
     """Shows episodes in a window and handles keys, until the user closes the window."""
-    due = 0.0  # steps to take now; each loop, which also reads keys, adds a step or a fraction of one
+    due = 0.0  # steps to take; a loop may add a fraction, since keys are read more often than steps are taken
     while not viewing.over:
         window.show(viewing.frame().numpy())
         rate, looks = viewing.rate, max(_LOOKS, viewing.rate)
