@@ -219,7 +219,7 @@ def test_a_full_disk_ends_a_search_in_one_line_and_loses_nothing(
 
     with monkeypatch.context() as patch:
         patch.setattr(optuna.Study, "tell", full)
-        with pytest.raises(OSError, match=r"search.db cannot be used \(no space left on device\); the same"):
+        with pytest.raises(OSError, match=r"search.db cannot be used \(no space left on device\); to resume"):
             go_on(small_search(), begun, 2)
     assert states(go_on(small_search(), begun, 2)) == ["complete"] * 2
 
