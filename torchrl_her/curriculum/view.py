@@ -17,8 +17,8 @@ class StageView:
 
     With it, a :class:`~torchrl_her.replay_buffers.StageRule` trains a stage on the transitions of all stages.
     Transitions that were played in the stage stay as they are. The others get the reward of the stage and
-    terminate by its rule. If their episode ended where the stage's would continue, it is truncated. After
-    Luo et al., Relay Hindsight Experience Replay, 2022 (arXiv 2208.00843).
+    terminate by its rule. One that ended its episode, but ends none in this stage, is marked as truncated.
+    After Luo et al., Relay Hindsight Experience Replay, 2022 (arXiv 2208.00843).
 
     Args:
         curriculum: the stages.

@@ -101,7 +101,7 @@ def load_tensors(file: BinaryIO, *, map_location: torch.device | str = "cpu") ->
         return loaded
     except (MoreThanDataError, _RefusedError):
         raise
-    except Exception as error:  # a damaged description may raise any error
+    except Exception as error:  # reading a damaged pickle may raise any error
         raise ValueError(f"it is damaged ({type(error).__name__})") from error
 
 

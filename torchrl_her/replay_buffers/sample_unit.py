@@ -171,7 +171,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
         self._token = uuid4().hex
 
     # Goals for ``relabel``, by unit and thread, since a buffer that prefetches draws several batches at once.
-    # A class attribute, because unit and ``relabel`` may be copied to another process one by one (Ray).
+    # A class attribute, since Ray copies unit and ``relabel`` separately; both copies find the goals here.
     _chosen: ClassVar[dict[tuple[str, int], _Chosen]] = {}
 
     # TorchRL's hooks
@@ -362,7 +362,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
     def _look_ahead(
         self, stored: _Stored, row: Tensor, virtual: Tensor, goals: Tensor
     ) -> tuple[TensorDictBase, NStepReturn]:
-        """Computes ``next`` and returns over n steps of rows [B], some of which have virtual goals."""
+        """Computes n-step returns of rows [B] and ``next`` at their ends; some rows have virtual goals."""
         gamma = self.options.gamma or 1.0  # never None if n_steps > 1
         place = stored.episodes.place(row)
         places, inside = windows(place, stored.episodes.episode(place)[1], self.options.n_steps)

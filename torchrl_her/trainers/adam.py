@@ -62,7 +62,7 @@ class RunsAdam(torch.optim.Adam):
         return state
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restores the state that ``state_dict`` returned; torch's own Adam leaves the counts on the CPU."""
+        """Restores the state that ``state_dict`` returned; unlike torch's, also moves counts of steps."""
         super().load_state_dict(state_dict)
         for parameter, state in self.state.items():
             state["step"] = state["step"].to(parameter.device)

@@ -1,9 +1,9 @@
 """Free balls in many worlds at once: flight by array code, contacts by one Chipmunk space (pymunk).
 
-pymunk simulates the balls that may touch something within a step: 3 to 12 % of the steps with random
-actions on the throwing tasks, none on `robot_v1`. Array code adds up free flight in Chipmunk's order, so
-results are equal to the last bit. Only this file imports pymunk; other files decide which balls are held,
-caught or thrown.
+pymunk simulates a ball's step only if the ball may touch something in it: 3 to 12 % of the steps with random
+actions on the throwing tasks, none on `robot_v1`. Array code adds up free flight in the order that Chipmunk
+has, so its results equal Chipmunk's to the last bit. Only this file imports pymunk; other files decide which
+balls are held, caught or thrown.
 """
 
 from __future__ import annotations

@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 _ON_RAY = "torchrl_her_recipes.components.collection.ray_workers:NodeWorkers"
 _SECONDS = 1.0  # seconds between two checks that all processes are alive
 _FAILED = "a process failed: worker {} (exit code {})"
-_TRACEBACK = "Worker traceback:"  # TorchRL's message repeats ``__cause__`` below this line
+_TRACEBACK = "Worker traceback:"  # TorchRL's message repeats ``__cause__`` after these words
 _EXIT_PRIORITY = 100  # high enough to end the processes before multiprocessing waits for them at exit
 
 
