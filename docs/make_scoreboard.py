@@ -78,19 +78,25 @@ def theirs(method: str, task: str, name: str) -> Curves:
     return read_curves("relay_her", {"method": method, "task": task}, name, window=4, episodes=10)
 
 
+def defaults(task: str) -> list[Curves]:
+    """Runs of the default agent on a task: as it is now, and with its earlier decay of epsilon."""
+    return [
+        ours(f"default agent on {task}", "default agent"),
+        ours(f"epsilon decays by 0.99 on {task}", "the same, `epsilon_decay=0.99`"),
+    ]
+
+
 def boards() -> dict[str, list[Curves]]:
     """Methods whose runs are known, by task."""
     return {
         "FetchPush": [
-            ours("default agent on FetchPush", "default agent"),
-            ours("epsilon decays by 0.99 on FetchPush", "the same, `epsilon_decay=0.99`"),
+            *defaults("FetchPush"),
             ours("default agent, one stage after the other", "the same, one stage after the other"),
             theirs("RHER", "FetchPush", "Relay-HER"),
             theirs("DDPG+HER", "FetchPush", "DDPG and HER, by Relay-HER's authors"),
         ],
         "FetchPickAndPlace": [
-            ours("default agent on FetchPickAndPlace", "default agent"),
-            ours("epsilon decays by 0.99 on FetchPickAndPlace", "the same, `epsilon_decay=0.99`"),
+            *defaults("FetchPickAndPlace"),
             ours(
                 "default agent, one stage after the other, on FetchPickAndPlace",
                 "one stage after the other, seeds 0 to 2",
@@ -98,14 +104,8 @@ def boards() -> dict[str, list[Curves]]:
             theirs("RHER", "FetchPickAndPlace", "Relay-HER"),
             theirs("DDPG+HER", "FetchPickAndPlace", "DDPG and HER, by Relay-HER's authors"),
         ],
-        "PandaPush": [
-            ours("default agent on PandaPush", "default agent"),
-            ours("epsilon decays by 0.99 on PandaPush", "the same, `epsilon_decay=0.99`"),
-        ],
-        "PandaPickAndPlace": [
-            ours("default agent on PandaPickAndPlace", "default agent"),
-            ours("epsilon decays by 0.99 on PandaPickAndPlace", "the same, `epsilon_decay=0.99`"),
-        ],
+        "PandaPush": defaults("PandaPush"),
+        "PandaPickAndPlace": defaults("PandaPickAndPlace"),
     }
 
 

@@ -169,7 +169,10 @@ def test_what_was_asked_for_takes_the_place_of_the_method() -> None:
             r"task.options.termination=success needs info\['is_success'\]",
         ),
         ({"termination": "own"}, "own needs compute_terminated, .*; choose success, reward, never"),
-        ({"dense": True}, "Plain-v0 has a dense reward: -4, .*, -1 and other values .*, 0 for equal goals"),
+        (
+            {"dense": True},
+            "Plain-v0 has a dense reward: -4, .*, -1 and other values for missed goals, 0 for equal goals",
+        ),
         ({"dense": True}, "as in task.options.achieved_reward=-0.2, or choose a"),
         ({"dense": True, "achieved_reward": 1}, "must be above -4, .* at most 0, .* got 1"),
         ({"dense": True, "achieved_reward": -5}, "must be above -4, .* got -5"),
