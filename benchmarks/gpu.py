@@ -164,6 +164,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     small = options.small or not torch.cuda.is_available()
     gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else f"GPU: {NOT_MEASURED}"
+    torch.set_num_threads(1)
     with one_core():
         steps = steps_table(small=small)
     text = [f"{describe('torch', 'torchrl')}; {gpu}", steps, climb_table(small=small)]

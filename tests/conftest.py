@@ -18,6 +18,7 @@ gc.disable()  # until all is collected, see below
 # for the processes that tests start.
 torch.set_num_threads(1)
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # for tests whose GPU sums in a fixed order
 
 
 @pytest.fixture(autouse=True, scope="session")

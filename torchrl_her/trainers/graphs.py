@@ -72,7 +72,7 @@ class GraphLearner(LossLearner):
         super().__init__(loss, optimizer, target, max_grad_norm=max_grad_norm, runs=runs)
         self.steps_per_graph = steps_per_graph
         self._device = next(loss.parameters()).device
-        self._step = torch.compile(self._update) if compile else self._update
+        self._step = torch.compile(self._update, dynamic=False) if compile else self._update
         self._recorded: dict[Any, _Recorded] = {}
         self._keys = [*loss.in_keys, WEIGHT, STEPS_KEY]
         self._priority = getattr(loss.tensor_keys, "priority", None)
@@ -146,7 +146,9 @@ class _Recorded:
         with torch.cuda.device(self._device):
             if not self._was_called:
                 self._was_called = True
-                return self._call_on_another_stream(rows)
+                # A copy has the strides of the rows to be recorded; with others, torch.compile would compile
+                # while the graph is recorded, which fails.
+                return self._call_on_another_stream(rows.clone())
             if self._graph is None:
                 self._graph = self._record(rows)
             else:

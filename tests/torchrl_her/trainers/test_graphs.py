@@ -200,6 +200,21 @@ def test_the_emulation_refuses_to_wait_and_leaves_what_was_there() -> None:
         value.normal_(generator=torch.Generator("cpu"))
 
 
+@pytest.mark.usefixtures("emulation")
+def test_recorded_rows_lie_in_memory_as_those_that_were_compiled_for() -> None:
+    _, learner = pair()
+    seen, step = [], learner._step
+
+    def spy(batch: TensorDictBase) -> dict[str, Tensor]:
+        seen.append([value.stride() for value in batch.values(True, True)])
+        return step(batch)
+
+    learner._step = spy
+    for number in range(2):  # called directly, then recorded
+        learner.update(rows(number, 2)[:, ::2], 1)  # a slice, like the part of an update
+    assert seen[0] == seen[1]
+
+
 @pytest.mark.full
 def test_compiled_steps_have_the_same_numbers() -> None:
     here, compiled = (LossLearner(**parts(RUNS, device="cpu")) for _ in range(2))
