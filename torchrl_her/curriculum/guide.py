@@ -12,8 +12,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
 
-from torchrl_her.curriculum.stages import Curriculum, CurriculumStage
-from torchrl_her.curriculum.transforms import take_columns
+from torchrl_her.curriculum.relay import Relay
+from torchrl_her.curriculum.stages import Curriculum
 
 
 class GuidedExploration(TensorDictModuleBase):
@@ -106,14 +106,10 @@ class GuidedExploration(TensorDictModuleBase):
         else:
             self.in_keys.append(stage_key)
             self._policy = (policy,)  # in a tuple, since a submodule's weights would be registered twice
-        self.curriculum, self.share, self.per = curriculum, share, per
+        self.relay, self.share, self.per = Relay(curriculum), share, per
         self.generators = [None] * runs if generators is None else list(generators)
         self.register_buffer("stage", torch.full((runs,), -1))
         self.guided: Tensor | None = None
-        # Columns of each stage's inputs, achieved goal and desired goal in ``Curriculum.extend(state)``.
-        self._columns = torch.tensor([self._columns_of(stage) for stage in curriculum.stages])
-        # The guide never acts in the last stage, whose threshold may be None and is not used here.
-        self._squares = torch.tensor([(stage.threshold or 0.0) ** 2 for stage in curriculum.stages])
 
     @property
     def guide(self) -> TensorDictModuleBase:
@@ -161,11 +157,11 @@ class GuidedExploration(TensorDictModuleBase):
             return tensordict
         acting, after = guided >= 0, guided + 1
         if self.per == "step" and top is not None:  # an achieved goal may have been lost again
-            after = self._after_the_last_achieved(state, top)
+            after = self.relay.stage(state).view(after.shape)
         else:
-            acting &= self._achieved(state, guided)
+            acting &= self.relay.achieved(state).gather(-1, guided.clamp(min=0))
         guided.copy_(torch.where(acting, -1 if top is None else torch.where(after < top, after, -1), guided))
-        inputs, *_ = self._look(state, guided)
+        inputs = self.relay.inputs(state, guided.squeeze(-1).clamp(min=0))
         rows = TensorDict({self.guide.in_keys[0]: inputs}, tensordict.batch_size)
         policy_action = tensordict.get(action_key)
         acts = guided >= 0 if policy_action.ndim == guided.ndim else (guided >= 0).squeeze(-1)
@@ -191,28 +187,3 @@ class GuidedExploration(TensorDictModuleBase):
                 drawn = drawn if episode_stage is None else drawn & (episode_stage > 0)
                 guided.copy_(torch.where(new, torch.where(drawn, first, -1), guided))
         return self.guided
-
-    def _after_the_last_achieved(self, state: Tensor, top: Tensor) -> Tensor:
-        """Returns the stage after the last one whose goal a row achieves, [B, 1]; 0 if it achieves none."""
-        after = torch.zeros_like(top)
-        for stage in range(len(self.curriculum) - 1):
-            after = torch.where(self._achieved(state, torch.full_like(top, stage)), stage + 1, after)
-        return after
-
-    def _achieved(self, state: Tensor, stage: Tensor) -> Tensor:
-        """Returns a mask [B, 1] of the rows that achieve the goal of the stage given for each row, [B, 1]."""
-        _, achieved, desired = self._look(state, stage)
-        squares = self._squares.to(state)[stage.clamp(min=0)].view(achieved.shape[:-1])
-        return ((achieved - desired).square().sum(-1) < squares).view(stage.shape)
-
-    def _look(self, state: Tensor, stage: Tensor) -> tuple[Tensor, ...]:
-        """Returns the network input, achieved goal and desired goal of each row in the stage given for it."""
-        index = self._columns.to(state.device)[stage.flatten().clamp(min=0)]
-        entries = take_columns(self.curriculum.extend(state), index)
-        goal = self.curriculum.goal_width
-        return entries.split([self.curriculum.input_width, goal, goal], -1)
-
-    def _columns_of(self, stage: CurriculumStage) -> list[int]:
-        inputs = [*stage.observation, *stage.desired_goal]
-        padded = self.curriculum.padded(inputs, self.curriculum.input_width)
-        return [*padded, *self.curriculum.goal_index(stage)]

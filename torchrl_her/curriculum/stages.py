@@ -131,6 +131,7 @@ class Curriculum:
 
     Attributes:
         stages: the stages, with indices in place of names and of constant goals.
+        resolved: the stages, with indices in place of names only.
         appended: the zero and the constant goals that :meth:`extend` appends to a state.
         observation_width, goal_width: widths of observations and goals in all stages: the widths of the
             last stage, as shorter ones are followed by zeros.
@@ -172,7 +173,7 @@ class Curriculum:
     ) -> None:
         if not stages:
             raise ValueError("a curriculum needs at least one stage, got none")
-        resolved = [_resolve(stage, names or {}) for stage in stages]
+        resolved = self.resolved = tuple(_resolve(stage, names or {}) for stage in stages)
         if resolved[-1].constant_goal:
             raise ValueError(
                 f"stage {resolved[-1].name!r}: the last stage is the full task, its goal must not be constant"

@@ -11,6 +11,7 @@ from typing import Any
 from torchrl.data import Categorical
 from torchrl.envs import EnvBase
 
+from torchrl_her.curriculum.stages import Curriculum, CurriculumStage
 from torchrl_her_envs.common.goal_env import goal_env
 
 KEYS = ("observation", "desired_goal")
@@ -35,6 +36,8 @@ class PolicyInfo:
         low, high: the least and the greatest action of the task, one number for each entry.
         normalize_clip: bound to which normalized inputs are clipped; None if the policy does not normalize.
             The policy itself normalizes: its inputs are the task's raw observations and goals.
+        stages: options of each :class:`~torchrl_her.CurriculumStage` of a policy that acts in a
+            :class:`~torchrl_her.curriculum.Relay`; empty for other policies.
         algorithm, learner, seed, frames: origin of the policy; frames are environment steps.
         success: share of 1,000 greedy episodes that end at their goal, with starts and goals from seeds that
             training does not use; NaN if it was not measured.
@@ -60,6 +63,7 @@ class PolicyInfo:
     low: tuple[float, ...]
     high: tuple[float, ...]
     normalize_clip: float | None = None
+    stages: tuple[dict[str, Any], ...] = ()
     algorithm: str
     learner: str
     seed: int
@@ -99,12 +103,19 @@ class PolicyInfo:
             yield "high", fits, f"be the last of the actions from 0, below {_WIDEST}"
         for name in ("success", "reached"):
             yield name, _is_number(getattr(self, name)), "be a number"
+        yield "stages", self._has_curriculum(), "be those of a curriculum"
         clip = self.normalize_clip
         yield "normalize_clip", clip is None or (_is_number(clip) and clip > 0), "be above 0 or None"
         words = isinstance(self.versions, dict) and all(
             isinstance(word, str) for pair in self.versions.items() for word in pair
         )
         yield "versions", words, "name packages and their versions"
+
+    @property
+    def curriculum(self) -> Curriculum | None:
+        """The stages that act in turn; None if the policy acts as in the last stage only."""
+        stages = [CurriculumStage(**stage) for stage in self.stages]
+        return Curriculum(stages, sum(self.widths.values())) if stages else None
 
     @property
     def discrete(self) -> bool:
@@ -120,6 +131,12 @@ class PolicyInfo:
         """Returns all values by name, as plain data."""
         return asdict(self)
 
+    def _has_curriculum(self) -> bool:
+        try:
+            return len(self.curriculum or ()) == len(self.stages)
+        except (TypeError, ValueError):
+            return False
+
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> PolicyInfo:
         """Makes the info from the values of :meth:`to_dict`, in which JSON may have turned tuples into lists.
@@ -129,7 +146,7 @@ class PolicyInfo:
         """
         try:
             lists = {name: tuple(values[name]) for name in ("action_shape", "low", "high")}
-            return cls(**{**values, **lists})
+            return cls(**{**values, **lists, "stages": tuple(values.get("stages", ()))})
         except (KeyError, TypeError) as error:
             raise ValueError(f"its info is damaged: {error}") from error
 

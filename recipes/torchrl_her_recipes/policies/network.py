@@ -8,10 +8,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
-from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
 from torchrl.data import Bounded, Categorical, TensorSpec
 
+from torchrl_her.curriculum.relay import Relay
 from torchrl_her.modules.normalization import RunningNorm, normalize
 from torchrl_her.modules.normalized import NormalizedPolicy
 from torchrl_her_recipes.components.agents import find_builder
@@ -41,9 +42,10 @@ def load_network(
     Raises:
         ValueError: the weights do not fit the network; this is checked before memory for it is allocated.
     """
+    curriculum = info.curriculum
     shape = AgentShape(
         task=info.task,
-        widths={key: info.widths[key] for key in KEYS},
+        widths=info.widths if curriculum is None else {"input": curriculum.input_width},
         action_spec=_action_spec(info),
         dtype=getattr(torch, info.dtype),
     )
@@ -56,9 +58,12 @@ def load_network(
     scaled = {*info.low} != {-1.0} or {*info.high} != {1.0}
     if not info.discrete and scaled and all(map(math.isfinite, (*info.low, *info.high))):
         net = ScaledActions(net, info.low, info.high)
-    greedy = TensorDictModule(net, in_keys=list(KEYS), out_keys=["action"])
-    norm = player.norm if isinstance(player, NormalizedPolicy) else None
-    return acting(greedy, norm).requires_grad_(False)
+    greedy = TensorDictModule(net, in_keys=list(shape.widths), out_keys=["action"])
+    policy = acting(greedy, player.norm if isinstance(player, NormalizedPolicy) else None)
+    if curriculum is not None:
+        relay = TensorDictModule(Relay(curriculum), in_keys=list(KEYS), out_keys=["input"])
+        policy = TensorDictSequential(relay, policy, selected_out_keys=["action"])
+    return policy.requires_grad_(False)
 
 
 def check_weights(builder: LearnerBuilder, weights: Mapping[str, Tensor]) -> None:
@@ -129,21 +134,26 @@ class TensorPolicy(nn.Module):
 
     def __init__(self, policy: TensorDictModuleBase) -> None:
         super().__init__()
+        self.relay: Any = None
+        if isinstance(policy, TensorDictSequential):
+            relay, policy = policy.module
+            self.relay = copy.deepcopy(relay.module)
         norm = policy.norm if isinstance(policy, NormalizedPolicy) else None
         actor: Any = policy.actor if isinstance(policy, NormalizedPolicy) else policy
         self.net: Any = copy.deepcopy(actor.module).float().eval()
-        self.normalizes = norm is not None
+        self.keys, self.normalizes = policy.in_keys, norm is not None
         if norm is not None:
-            for key in KEYS:
+            for key in self.keys:
                 for name, value in zip(_CONSTANTS, _constants(norm, key), strict=True):
                     self.register_buffer(f"{key}_{name}", value)
 
     def normalized(self, *inputs: Tensor) -> list[Tensor]:
-        """Returns an observation and a desired goal as inputs of the network, normalized if it normalizes."""
+        """Returns the network's inputs for an observation and a desired goal."""
+        values = inputs if self.relay is None else [self.relay(*inputs)]
         if not self.normalizes:
-            return list(inputs)
-        constants = [[getattr(self, f"{key}_{name}") for name in _CONSTANTS] for key in KEYS]
-        return [normalize(value, *stats) for value, stats in zip(inputs, constants, strict=True)]
+            return list(values)
+        constants = [[getattr(self, f"{key}_{name}") for name in _CONSTANTS] for key in self.keys]
+        return [normalize(value, *stats) for value, stats in zip(values, constants, strict=True)]
 
     def forward(self, observation: Tensor, desired_goal: Tensor) -> Tensor:
         """Maps inputs [rows, width] to actions [rows, actions], or to integers [rows]."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -153,13 +153,14 @@ class Policy(TensorDictModuleBase):
             versions=present_versions(),
         )
         curriculum, width = make_curriculum(envs.curriculum, env), sum(info.widths.values())
-        # For each input of the network, its position in the concatenated observation and desired goal
-        places = torch.arange(width)
-        if curriculum is not None:
-            last = curriculum.state_index[-1]
-            places = torch.cat((last[: curriculum.observation_width], last[-curriculum.goal_width :]))
         with naming(file):
-            weights = _as_shown(take_run(actor, chosen, runs), places, width)
+            weights = take_run(actor, chosen, runs)
+            if curriculum is not None and getattr(recipe.order, "relay", False):
+                info = replace(info, stages=tuple(map(asdict, curriculum.resolved)))
+            elif curriculum is not None:
+                last = curriculum.state_index[-1]
+                places = torch.cat((last[: curriculum.observation_width], last[-curriculum.goal_width :]))
+                weights = _as_shown(weights, places, width)
             return cls(info, recipe.replace(num_runs=1, seed=info.seed), weights, source)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -327,8 +328,8 @@ def _as_shown(actor: dict[str, Tensor], places: Tensor, width: int) -> dict[str,
 
     Args:
         actor: Weights of the actor and its normalization.
-        places: Position of each of the actor's inputs in the new order.
-        width: Number of inputs in the new order.
+        places: Position of each of the actor's inputs in the concatenated observation and desired goal.
+        width: Number of these entries.
     """
     moved = dict(actor)
     for key, value in actor.items():

@@ -54,6 +54,7 @@ def test_a_card_survives_plain_data() -> None:
         ),
         ({"success": "much"}, "success of a policy must be a number, got 'much'"),
         ({"normalize_clip": 0.0}, "normalize_clip of a policy must be above 0 or None, got '0.0'"),
+        ({"stages": ({"name": "reach"},)}, "stages of a policy must be those of a curriculum, got"),
         ({"versions": {"torch": 2}}, "versions of a policy must name packages and their versions"),
     ],
 )

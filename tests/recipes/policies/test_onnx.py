@@ -31,7 +31,12 @@ def played(path: Path, seen: TensorDictBase) -> np.ndarray:
 
 @pytest.mark.parametrize(
     "options",
-    [*LEARNERS, {"learner": "ddpg", "normalize": True}, {"learner": "sac", "dtype": "float64", "scale": 3.0}],
+    [
+        *LEARNERS,
+        {"learner": "ddpg", "normalize": True},
+        {"learner": "sac", "dtype": "float64", "scale": 3.0},
+        {"learner": "td3", "normalize": True, "relay": True},
+    ],
     ids=lambda options: "_".join(str(value) for value in options.values()),
 )
 def test_onnxruntime_gives_the_policy_s_actions(options: dict[str, Any], tmp_path: Path) -> None:

@@ -51,6 +51,9 @@ def backwards() -> list[dict[str, Any]]:
         {"algo": "cher", "normalize": True},
         {"algo": "cher", "curriculum": backwards()},
         {"algo": "cher", "curriculum": backwards(), "normalize": True},
+        {"algo": "cher", "order": "all_at_once", "relay": True},
+        {"algo": "cher", "order": "all_at_once", "relay": True, "normalize": True},
+        {"algo": "cher", "curriculum": backwards(), "order": "all_at_once", "relay": True},
         pytest.param({"algo": "her", "learner": "td3"}, marks=pytest.mark.full),
         {"algo": "filtered_her", "learner": "sac", "normalize": True},
         pytest.param({"algo": "cher", "learner": "tqc"}, marks=pytest.mark.full),
@@ -67,9 +70,11 @@ def test_an_exported_policy_acts_as_its_run_does(options: dict[str, Any], tmp_pa
     assert written.info.frames == 480
     seen = make_env(recipe.task.name, num_envs=4, seed=7).reset()
     shown = make_played_env(TaskEnvs.of(recipe), 4, [7]).reset()
-    played = components.greedy(torch.cat((shown, shown)))["action"][4:]  # of the second of two runs
+    played = components.player(torch.cat((shown, shown)))["action"][4:]  # of the second of two runs
     for own in (load_policy(tmp_path / "run", run=1), load_policy(tmp_path / "policy.safetensors"), written):
-        torch.testing.assert_close(own(seen.clone())["action"], played)
+        acted = own(seen.clone())
+        torch.testing.assert_close(acted["action"], played)
+        assert {*acted.keys()} == {*seen.keys(), "action"}
 
 
 def test_export_takes_the_median_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import pytest
@@ -13,8 +13,10 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from torchrl_her.modules import RunningNorm
+from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_recipes import Policy, PolicyInfo, Recipe, make_recipe
 from torchrl_her_recipes.components.agents import find_builder, shape_of
+from torchrl_her_recipes.components.curricula import read_curriculum
 from torchrl_her_recipes.components.envs import TaskEnvs
 from torchrl_her_recipes.components.learner import acting
 from torchrl_her_recipes.policies.info import describe_env
@@ -41,7 +43,7 @@ def make_player(recipe: Recipe, env: EnvBase) -> TensorDictModuleBase:
         return acting(builder.player(recipe.run.num_runs), builder.norm())
 
 
-def tiny_policy(*, task: str = "hand_v1", scale: float = 1.0, **options: Any) -> Policy:
+def tiny_policy(*, task: str = "hand_v1", scale: float = 1.0, relay: bool = False, **options: Any) -> Policy:
     """A policy whose actions differ from state to state, with statistics of inputs if it normalizes."""
     recipe = make_recipe(task=task, algo="her", hidden=8, **options)
     env = TaskEnvs.of(recipe).make(1, [0])
@@ -65,6 +67,9 @@ def tiny_policy(*, task: str = "hand_v1", scale: float = 1.0, **options: Any) ->
     )
     if scale != 1.0:
         info = replace(info, low=tuple(-scale for _ in info.low), high=tuple(2 * scale for _ in info.high))
+    if relay:  # with a threshold that divides random states
+        stages = read_curriculum(goal_env(env).stages(), goal_env(env)).resolved
+        info = replace(info, stages=tuple(asdict(stage) | {"threshold": 3.0} for stage in stages))
     for module in player.modules():
         if isinstance(module, RunningNorm):
             module.update(states(info, 200, mean=3.0))

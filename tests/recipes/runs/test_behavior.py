@@ -226,6 +226,7 @@ def test_the_cutoff_is_in_the_unit_of_the_tasks_values() -> None:
             {"algo": "cher", "learner": "sac", "order": "all_at_once", "success_threshold": 0.5},
             "order=all_at_once has no option success_threshold; order=threshold has it",
         ),
+        ({"algo": "cher", "relay": True}, "order=threshold has no option relay; order=all_at_once or t"),
         ({"behavior": "uniform_achieved", "candidates": 7}, "behavior=uniform_achieved has no option c"),
         ({"behavior": "mega", "real_share": 1.0, "candidates": 7}, "candidates=7 has no effect with real_sh"),
         ({"algo": "no_hindsight", "virtual_goals": True}, "virtual_goals=True has no effect with algo=no_h"),

@@ -17,8 +17,9 @@ class Order(Choice):
     The maker takes the options and the :class:`~torchrl_her.Curriculum`, and by keyword the number of
     ``runs`` and their random ``generators``. It returns a :class:`~torchrl_her.CurriculumProgress`, or an
     :class:`~torchrl_her.curriculum.EpisodeStages` if each episode has a stage of its own. An order may have
-    the options ``every_stage``, which stores each transition for every stage if episodes have stages, and
-    ``stage_epsilon``, the epsilon with which a run begins a stage (1 without this option).
+    the options ``every_stage``, which stores each transition for every stage if episodes have stages,
+    ``relay``, with which the stages of the greedy policy act in turn, and ``stage_epsilon``, the epsilon with
+    which a run begins a stage (1 without this option).
     """
 
 
@@ -43,6 +44,11 @@ class Threshold(Order):
 class _ByEpisode(Order):
     every_stage: bool = option(
         False, "whether each transition is stored for every stage, not just the stage of its episode"
+    )
+    relay: bool = option(
+        False,
+        "whether the greedy policy acts in each step as in the stage after the last one whose goal is "
+        "achieved, and not always as in the last stage",
     )
 
 
