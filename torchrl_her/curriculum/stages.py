@@ -33,8 +33,8 @@ class CurriculumStage:
         name: name of the stage, for messages and reports.
         observation, achieved_goal, desired_goal: indices into the state vector, or names that the argument
             ``names`` of :class:`~torchrl_her.Curriculum` translates to indices.
-        constant_goal: one goal for all episodes, like a gap in a wall, in place of ``desired_goal``; in the
-            unit of the achieved goal.
+        constant_goal: entries of the goal that are the same in all episodes, like a gap in a wall or open
+            fingers, in the unit of the achieved goal. They follow those of ``desired_goal``, if it has any.
         threshold: the goal is achieved at distances below this, in the unit of the state. The last stage,
             which is the environment's own task, needs no threshold: its goals are relabeled by the reward
             function that the writer was made with.
@@ -43,8 +43,8 @@ class CurriculumStage:
 
     Raises:
         ValueError: a list is empty, an index is negative or repeated, the desired goal shares an index with
-            another list, the goals differ in width, both kinds of goals are given, a constant goal is not
-            finite, or the threshold is not positive.
+            another list, the goals differ in width, a constant goal is not finite, or the threshold is not
+            positive.
 
     Example:
         >>> CurriculumStage(
@@ -70,8 +70,6 @@ class CurriculumStage:
         object.__setattr__(self, "constant_goal", tuple(map(float, self.constant_goal)))
         if not all(map(math.isfinite, self.constant_goal)):
             raise ValueError(f"stage {self.name!r}: constant_goal must be finite, got {self.constant_goal}")
-        if self.constant_goal and self.desired_goal:
-            raise ValueError(f"stage {self.name!r}: give desired_goal or constant_goal, got both")
         for key in _LISTS:
             value = getattr(self, key)
             entries = [value] if isinstance(value, str) else list(value)
@@ -105,7 +103,7 @@ class CurriculumStage:
                 raise ValueError(
                     f"stage {self.name!r}: desired_goal must share no index with {key}, got {shared} in both"
                 )
-        goal = self.desired_goal or self.constant_goal
+        goal = (*self.desired_goal, *self.constant_goal)
         if len(self.achieved_goal) != len(goal):
             raise ValueError(
                 f"stage {self.name!r}: achieved_goal and the goal must have the same width, "
@@ -188,7 +186,7 @@ class Curriculum:
         self.appended = [0.0, *(number for stage in resolved for number in stage.constant_goal)]
         ends = accumulate((len(stage.constant_goal) for stage in resolved), initial=state_width + 1)
         self.stages = tuple(
-            replace(stage, desired_goal=range(start, end), constant_goal=()) if end > start else stage
+            replace(stage, desired_goal=(*stage.desired_goal, *range(start, end)), constant_goal=())
             for stage, (start, end) in zip(resolved, pairwise(ends), strict=True)
         )
         self.input_width = self.observation_width + self.goal_width

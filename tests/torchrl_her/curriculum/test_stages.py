@@ -102,7 +102,7 @@ def test_a_stage_keeps_what_it_is_given() -> None:
             r"stage 'one': desired_goal must share no index with achieved_goal, got \[0\]",
         ),
         ({"desired_goal": [2, 3]}, r"stage 'one': .* the same width, got \(0,\) and \(2, 3\)"),
-        ({"constant_goal": [0.5]}, r"stage 'one': give desired_goal or constant_goal, got both"),
+        ({"constant_goal": [0.5]}, r"stage 'one': .* the same width, got \(0,\) and \(2, 0.5\)"),
         ({"desired_goal": [], "constant_goal": [math.nan]}, r"constant_goal must be finite, got \(nan,\)"),
         ({"desired_goal": [], "constant_goal": [1.0, 2.0]}, r"the same width, got \(0,\) and \(1.0, 2.0\)"),
         ({"desired_goal": []}, r"stage 'one': desired_goal must not be empty"),
@@ -113,21 +113,30 @@ def test_bad_stages_are_named(options: dict[str, Any], message: str) -> None:
         make_stage(**options)
 
 
-def test_a_stage_may_have_a_constant_goal() -> None:
+def test_a_goal_or_its_last_entries_may_be_constant() -> None:
     gap = CurriculumStage(
         name="gap", observation=[0, 1], achieved_goal=[0, 1], constant_goal=[5.0, 8.5], threshold=0.5
     )
     cross = CurriculumStage(
         name="cross", observation=[0, 1], achieved_goal=[0, 1], desired_goal=[2, 3], threshold=0.5
     )
-    curriculum = Curriculum([gap, cross], 4)
+    half = CurriculumStage(
+        name="half",
+        observation=[0, 1],
+        achieved_goal=[0, 1],
+        desired_goal=[2],
+        constant_goal=[0.5],
+        threshold=0.5,
+    )
+    curriculum = Curriculum([gap, half, cross], 4)
     states = torch.tensor([[1.0, 2.0, 3.0, 4.0], [6.0, 7.0, 8.0, 9.0]])
     index = curriculum.state_index
     assert curriculum.extend(states)[:, index[0]].tolist() == [
         [1.0, 2.0, 1.0, 2.0, 5.0, 8.5],
         [6.0, 7.0, 6.0, 7.0, 5.0, 8.5],
     ]
-    assert curriculum.extend(states)[1, index[1]].tolist() == [6.0, 7.0, 6.0, 7.0, 8.0, 9.0]
+    assert curriculum.extend(states)[1, index[1]].tolist() == [6.0, 7.0, 6.0, 7.0, 8.0, 0.5]
+    assert curriculum.extend(states)[1, index[2]].tolist() == [6.0, 7.0, 6.0, 7.0, 8.0, 9.0]
 
 
 def test_goals_narrower_than_the_last_stage_s_have_zeros_behind_them() -> None:
