@@ -3,7 +3,7 @@
 from torchrl_her.curriculum.guide import GuidedExploration
 from torchrl_her.curriculum.normalization import count_inputs, restart_inputs
 from torchrl_her.curriculum.orders import EpisodeStages, TeacherStudent
-from torchrl_her.curriculum.relay import Relay
+from torchrl_her.curriculum.relay import Relay, RelayPolicy
 from torchrl_her.curriculum.stages import Curriculum, CurriculumProgress, CurriculumStage, zero_unused_inputs
 from torchrl_her.curriculum.switch import enter_stage, set_stage_goals
 from torchrl_her.curriculum.transforms import StageOutcomes, StateToObs, ZeroPad
@@ -16,6 +16,7 @@ __all__ = [
     "EpisodeStages",
     "GuidedExploration",
     "Relay",
+    "RelayPolicy",
     "StageOutcomes",
     "StageView",
     "StateToObs",

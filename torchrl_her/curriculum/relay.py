@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from torchrl_her.curriculum.stages import Curriculum
@@ -11,17 +15,14 @@ from torchrl_her.curriculum.stages import Curriculum
 class Relay(nn.Module):
     """Selects a network's input from states, in the stage after the last one whose goal is achieved.
 
-    In front of a policy that has learned all stages at once, it makes a policy whose stages act in turn: a
-    gripper goes to a block until it is there, and then places it. So the goal of a stage must include all
-    that the next stage requires. :class:`~torchrl_her.GuidedExploration` guides in the same way, after Luo et
-    al., Relay Hindsight Experience Replay, 2022 (arXiv 2208.00843).
+    It has no weights: policies use it to act (:class:`RelayPolicy`), and
+    :class:`~torchrl_her.GuidedExploration` to guide.
 
     Args:
         curriculum: the stages.
 
     Example:
-        >>> from tensordict.nn import TensorDictModule, TensorDictSequential
-        >>> from torchrl_her import CurriculumStage, make_actor
+        >>> from torchrl_her import CurriculumStage
         >>> reach = CurriculumStage(
         ...     name="reach", observation=[0], achieved_goal=[0], desired_goal=[1], threshold=1
         ... )
@@ -31,8 +32,6 @@ class Relay(nn.Module):
         >>> relay = Relay(Curriculum([reach, move], 3))
         >>> relay(torch.tensor([[5.0, 8.0, 9.0], [7.5, 8.0, 9.0]])).tolist()  # [gripper, block, goal]
         [[5.0, 8.0, 0.0], [7.5, 8.0, 9.0]]
-        >>> actor = make_actor([3], 1, in_keys=["input"])
-        >>> in_turn = TensorDictSequential(TensorDictModule(relay, ["state"], ["input"]), actor)
     """
 
     _inputs: Tensor
@@ -74,3 +73,50 @@ class Relay(nn.Module):
         """Maps states [..., state_width], whole or in parts to be joined, to inputs [..., input_width]."""
         state = torch.cat(entries, -1)
         return self.inputs(state, self.stage(state))
+
+
+class RelayPolicy(TensorDictModuleBase):
+    """Policy of all stages of a curriculum, which act in turn.
+
+    In each step it acts as in the stage after the last one whose goal is achieved: a gripper goes to a block
+    until it is there, then it places the block, and goes back if it has lost the block. So the goal of a
+    stage must include all that the next stage requires. Exploration is guided in this way by Luo et al.,
+    Relay Hindsight Experience Replay, 2022 (arXiv 2208.00843).
+
+    Args:
+        policy: a policy that has learned all stages. Its only input is the network's input.
+        curriculum: the stages.
+
+    Keyword Args:
+        in_keys: key of the state vector, or keys of parts that make it if they are joined.
+        action_key: key of the action, which is written.
+
+    Example:
+        >>> from torchrl_her import CurriculumStage, make_actor
+        >>> stages = [
+        ...     CurriculumStage(name=n, observation=[0, 1], achieved_goal=[i], desired_goal=[2], threshold=1)
+        ...     for i, n in enumerate(("near", "far"))
+        ... ]
+        >>> policy = RelayPolicy(make_actor([3], 1, in_keys=["input"]), Curriculum(stages, 3))
+        >>> policy(TensorDict({"state": torch.zeros(5, 3)}, [5]))["action"].shape
+        torch.Size([5, 1])
+    """
+
+    def __init__(
+        self,
+        policy: TensorDictModuleBase,
+        curriculum: Curriculum,
+        *,
+        in_keys: Sequence[NestedKey] = ("state",),
+        action_key: NestedKey = "action",
+    ) -> None:
+        super().__init__()
+        self.in_keys, self.out_keys = list(in_keys), [action_key]
+        self.module, self.relay = policy, Relay(curriculum)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the action."""
+        inputs = self.relay(*(tensordict.get(key) for key in self.in_keys))
+        rows = TensorDict({self.module.in_keys[0]: inputs}, tensordict.batch_size)
+        (action_key,) = self.out_keys
+        return tensordict.set(action_key, self.module(rows).get(action_key))

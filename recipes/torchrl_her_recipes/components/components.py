@@ -9,14 +9,14 @@ from dataclasses import dataclass
 from typing import cast
 
 import torch
-from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.collectors import BaseCollector
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs import EnvBase
 
 from torchrl_her.behavior import BehaviorGoals
-from torchrl_her.curriculum.relay import Relay
+from torchrl_her.curriculum.relay import RelayPolicy
 from torchrl_her.goals.instructive import InstructiveWeights
 from torchrl_her.native.library import CannotCompile
 from torchrl_her.trainers.fused import FusedLearner, MatmulDtype
@@ -104,8 +104,7 @@ class Components(Agent):
         policy = policy if place_of(policy) == place else deepcopy(policy).to(place)
         if self.curriculum is None or not getattr(self.recipe.order, "relay", False):
             return policy
-        relay = TensorDictModule(Relay(self.curriculum.curriculum), ["state"], policy.in_keys)
-        return TensorDictSequential(relay.to(place), policy)
+        return RelayPolicy(policy, self.curriculum.curriculum).to(place)
 
     def learner(self) -> Learner:
         """Makes the learner. It compiles gradient steps if possible, and otherwise calls the loss module.

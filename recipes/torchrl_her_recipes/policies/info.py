@@ -37,7 +37,7 @@ class PolicyInfo:
         normalize_clip: bound to which normalized inputs are clipped; None if the policy does not normalize.
             The policy itself normalizes: its inputs are the task's raw observations and goals.
         stages: options of each :class:`~torchrl_her.CurriculumStage` of a policy that acts in a
-            :class:`~torchrl_her.curriculum.Relay`; empty for other policies.
+            :class:`~torchrl_her.curriculum.RelayPolicy`; empty for other policies.
         algorithm, learner, seed, frames: origin of the policy; frames are environment steps.
         success: share of 1,000 greedy episodes that end at their goal, with starts and goals from seeds that
             training does not use; NaN if it was not measured.

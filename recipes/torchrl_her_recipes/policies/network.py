@@ -8,11 +8,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
-from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.data import Bounded, Categorical, TensorSpec
 
-from torchrl_her.curriculum.relay import Relay
+from torchrl_her.curriculum.relay import RelayPolicy
 from torchrl_her.modules.normalization import RunningNorm, normalize
 from torchrl_her.modules.normalized import NormalizedPolicy
 from torchrl_her_recipes.components.agents import find_builder
@@ -61,8 +61,7 @@ def load_network(
     greedy = TensorDictModule(net, in_keys=list(shape.widths), out_keys=["action"])
     policy = acting(greedy, player.norm if isinstance(player, NormalizedPolicy) else None)
     if curriculum is not None:
-        relay = TensorDictModule(Relay(curriculum), in_keys=list(KEYS), out_keys=["input"])
-        policy = TensorDictSequential(relay, policy, selected_out_keys=["action"])
+        policy = RelayPolicy(policy, curriculum, in_keys=KEYS)
     return policy.requires_grad_(False)
 
 
@@ -135,9 +134,8 @@ class TensorPolicy(nn.Module):
     def __init__(self, policy: TensorDictModuleBase) -> None:
         super().__init__()
         self.relay: Any = None
-        if isinstance(policy, TensorDictSequential):
-            relay, policy = policy.module
-            self.relay = copy.deepcopy(relay.module)
+        if isinstance(policy, RelayPolicy):
+            self.relay, policy = copy.deepcopy(policy.relay), policy.module
         norm = policy.norm if isinstance(policy, NormalizedPolicy) else None
         actor: Any = policy.actor if isinstance(policy, NormalizedPolicy) else policy
         self.net: Any = copy.deepcopy(actor.module).float().eval()

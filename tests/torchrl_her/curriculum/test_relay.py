@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import pytest
 import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
 from torch import Tensor
 
 from torchrl_her import Curriculum, CurriculumStage
-from torchrl_her.curriculum import Relay
+from torchrl_her.curriculum import Relay, RelayPolicy
 
 # The state is [gripper, block, higher block, wanted place, wanted place of the higher block].
 STAGES = [
@@ -46,6 +48,13 @@ def test_batches_may_have_any_shape_and_states_come_in_parts() -> None:
     assert torch.equal(relay(rows), expected)
     blocks: Tensor = rows.view(2, 1, 2, 5)
     assert torch.equal(relay(blocks[..., :3], blocks[..., 3:]), expected.view(2, 1, 2, 5))
+
+
+def test_its_input_replaces_none_of_the_environment() -> None:
+    actor = TensorDictModule(lambda seen: seen.sum(-1, keepdim=True), ["input"], ["action"])
+    rows = TensorDict({"state": torch.tensor([FAR]), "input": torch.ones(1, 5)}, [1])
+    assert RelayPolicy(actor, CURRICULUM)(rows)["action"].tolist() == [[7.5]]
+    assert torch.equal(rows["input"], torch.ones(1, 5))  # which the critics value
 
 
 def test_it_has_no_weights_that_a_checkpoint_would_need() -> None:
