@@ -42,15 +42,13 @@ class Relay(nn.Module):
     def __init__(self, curriculum: Curriculum) -> None:
         super().__init__()
         self.curriculum = curriculum
-        # Columns of ``Curriculum.extend(state)``: of each stage's input, and of the goals below the last,
-        # whose goal ends the task and may have no threshold.
+        # Columns of ``Curriculum.extend(state)``: of each stage's input, and of the goals below the last one,
+        # which ends the task and may have no threshold.
         inputs = ([*stage.observation, *stage.desired_goal] for stage in curriculum.stages)
-        below = curriculum.stages[:-1]
-        goals = torch.tensor([index for stage in below for index in curriculum.goal_index(stage)]).long()
         tables = {
             "_inputs": torch.tensor([curriculum.padded(each, curriculum.input_width) for each in inputs]),
-            "_goals": goals.view(len(below), 2 * curriculum.goal_width),
-            "_squares": torch.tensor([(stage.threshold or 0.0) ** 2 for stage in below]),
+            "_goals": curriculum.state_index[:-1, curriculum.observation_width :],
+            "_squares": torch.tensor([(stage.threshold or 0.0) ** 2 for stage in curriculum.stages[:-1]]),
             "_after": torch.arange(1, len(curriculum)),
         }
         for name, table in tables.items():

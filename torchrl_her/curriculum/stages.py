@@ -249,12 +249,9 @@ class Curriculum:
                 )
 
     def _state_index(self, stage: CurriculumStage) -> list[Any]:
-        return [*self.padded(stage.observation, self.observation_width), *self.goal_index(stage)]
-
-    def goal_index(self, stage: CurriculumStage) -> list[Any]:
-        """Returns the indices of a stage's achieved and desired goal, each :meth:`padded` to one width."""
         goals = (stage.achieved_goal, stage.desired_goal)
-        return [index for goal in goals for index in self.padded(goal, self.goal_width)]
+        padded = (index for goal in goals for index in self.padded(goal, self.goal_width))
+        return [*self.padded(stage.observation, self.observation_width), *padded]
 
     def padded(self, indices: Indices, width: int) -> list[Any]:
         """Pads indices into the extended state to a width, with the index of the zero in that state."""

@@ -133,7 +133,7 @@ class PolicyInfo:
 
     def _has_curriculum(self) -> bool:
         try:
-            return len(self.curriculum or ()) == len(self.stages)
+            return self.curriculum is not None or not self.stages
         except (TypeError, ValueError):
             return False
 
