@@ -39,6 +39,8 @@ class CurriculumStage:
             which is the environment's own task, needs no threshold: its goals are relabeled by the reward
             function that the writer was made with.
         rewards: rewards of a missed and of an achieved goal, in stages below the last.
+        terminates: whether achieving the goal ends the stage's episode, in stages below the last. If not, the
+            goal has to be held: a block that slides through it does not count for more than that step.
         instructive: whether IBS weights apply in this stage.
 
     Raises:
@@ -59,6 +61,7 @@ class CurriculumStage:
     desired_goal: Indices = ()
     threshold: float | None = None
     rewards: tuple[float, float] = (-1.0, 0.0)
+    terminates: bool = True
     constant_goal: Sequence[float] = ()
     instructive: bool = True
 
@@ -87,7 +90,9 @@ class CurriculumStage:
         if self.threshold is None:
             return None
         missed, achieved = self.rewards
-        return GoalReward(self.threshold, missed_reward=missed, achieved_reward=achieved)
+        return GoalReward(
+            self.threshold, missed_reward=missed, achieved_reward=achieved, terminates=self.terminates
+        )
 
     def _check_indices(self) -> None:
         """Checks a stage's indices, except against the width of the state, which :class:`Curriculum` does."""

@@ -124,7 +124,8 @@ class StateToObs(_StageTransform):
 
     The last stage is the environment's own task: its reward and its ends stay as they are. In the stages
     below, ``next`` gets reward and ``terminated`` of the stage's ``reward_fn``: 0 and True where the goal is
-    nearer than the stage's threshold, -1 and False elsewhere. ``done`` becomes ``terminated | truncated``.
+    nearer than the stage's threshold, -1 and False elsewhere (always False if the goal has to be held, that
+    is, if the stage has ``terminates=False``). ``done`` becomes ``terminated | truncated``.
     ``truncated`` stays as it was, so the environment must set it at its time limit even if its own goal is
     achieved.
 
@@ -324,7 +325,7 @@ class StageOutcomes(Transform):
     Keyword Args:
         reward_fn, achieved_reward: decide which goals are achieved in the last stage, where achieving a goal
             need not terminate; see :func:`~torchrl_her.goals.is_achieved`.
-        keys: keys of the flags ``terminated`` and ``done``, which are read.
+        keys: keys of the reward and the flag ``done``, which are read.
         stage_key: key of the stage, which is read.
     """
 
@@ -340,6 +341,8 @@ class StageOutcomes(Transform):
         super().__init__()
         self.progress, self.stage_key = progress, stage_key
         self.reward_fn, self.achieved_reward, self.keys = reward_fn, achieved_reward, keys
+        stages = progress.curriculum.stages
+        self._least = torch.tensor([stage.rewards[1] for stage in stages], dtype=torch.float64)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         done, proposed = next_tensordict.get(self.keys.done), tensordict.get(PROPOSED, None)
@@ -347,10 +350,10 @@ class StageOutcomes(Transform):
         if bool(ended.any()):
             stage, runs = tensordict.get(self.stage_key), self.progress.runs
             stages = len(self.progress.curriculum)
+            reward = next_tensordict.get(self.keys.reward)
             met = is_achieved(next_tensordict, self.reward_fn, achieved_reward=self.achieved_reward)
-            met = torch.where(
-                stage == stages - 1, met.view_as(stage), next_tensordict.get(self.keys.terminated)
-            )
+            below = reward >= self._least.to(reward)[stage]
+            met = torch.where(stage == stages - 1, met.view_as(stage), below)
             achieved = ended & met
             place = stage.reshape(runs, -1) + stages * torch.arange(runs, device=stage.device).unsqueeze(1)
             counts = [

@@ -71,13 +71,14 @@ def achieved(achieved_goal: Tensor, desired_goal: Tensor, threshold: float) -> T
 
 
 class GoalReward:
-    """Sparse reward: 0 where the goal is achieved, which terminates the episode, and -1 elsewhere.
+    """Sparse reward: 0 where the goal is achieved, -1 elsewhere; achieving it terminates the episode.
 
     Args:
         threshold: goals nearer than this count as achieved; in the unit of the goals.
 
     Keyword Args:
         missed_reward, achieved_reward: rewards of a missed and of an achieved goal.
+        terminates: whether achieving the goal terminates the episode; if not, it pays to stay there.
 
     Raises:
         ValueError: ``threshold`` is not positive, or not finite.
@@ -89,17 +90,24 @@ class GoalReward:
     """
 
     def __init__(
-        self, threshold: float, *, missed_reward: float = -1.0, achieved_reward: float = 0.0
+        self,
+        threshold: float,
+        *,
+        missed_reward: float = -1.0,
+        achieved_reward: float = 0.0,
+        terminates: bool = True,
     ) -> None:
         if not 0 < threshold < torch.inf:
             raise ValueError(f"threshold must be positive and finite, got {threshold}")
         self.threshold, self.missed_reward, self.achieved_reward = threshold, missed_reward, achieved_reward
+        self.terminates = terminates
 
     def __call__(self, achieved_goal: Tensor, desired_goal: Tensor) -> tuple[Tensor, Tensor]:
         """Returns (reward, terminated), each [..., 1], for goals [..., g]."""
-        terminated = achieved(achieved_goal, desired_goal, self.threshold).unsqueeze(-1)
+        met = achieved(achieved_goal, desired_goal, self.threshold).unsqueeze(-1)
         dtype = achieved_goal.dtype if achieved_goal.is_floating_point() else torch.get_default_dtype()
-        return torch.where(terminated, self.achieved_reward, self.missed_reward).to(dtype), terminated
+        reward = torch.where(met, self.achieved_reward, self.missed_reward).to(dtype)
+        return reward, met if self.terminates else torch.zeros_like(met)
 
 
 class EnvReward:

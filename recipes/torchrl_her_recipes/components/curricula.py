@@ -87,11 +87,12 @@ def read_curriculum(stages: object, env: GoalEnv) -> Curriculum:
 
 def _read_stage(options: Any, env: GoalEnv, *, is_last: bool) -> CurriculumStage:
     try:
-        if is_last and "threshold" in options:
-            raise ValueError(
-                f"stage {options.get('name')!r}: threshold has no effect in the last stage, where the "
-                "environment decides if goals are achieved; leave it out"
-            )
+        for option in ("threshold", "terminates"):
+            if is_last and option in options:
+                raise ValueError(
+                    f"stage {options.get('name')!r}: {option} has no effect in the last stage, where the "
+                    "environment decides if goals are achieved; leave it out"
+                )
         return CurriculumStage(**options, rewards=reward_range(env))
     except TypeError as error:  # options are missing or unknown, or ``options`` is not a mapping
         raise ValueError(f"{options!r} is no stage of a curriculum: {error}") from error

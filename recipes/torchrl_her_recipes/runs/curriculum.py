@@ -29,12 +29,14 @@ def stage_success(
 ) -> Tensor:
     """Returns success [R, n] at goals of each run's stage; ``rollout`` has episodes of the full task."""
     runs, last = components.recipe.run.num_runs, len(state.curriculum) - 1
-    full = success(rollout, **judging(components.eval_env)).float().view(runs, -1)
+    judged_by = judging(components.eval_env)
+    full = success(rollout, **judged_by).float().view(runs, -1)
     below = state.progress.stage < last
     if state.stage_env is None or not bool(below.any()):
         return full
     played = play_greedily(components, state.stage_env, epoch)
-    in_stage = at_the_end(played, played["next", "terminated"].squeeze(-1)).float().view(runs, -1)
+    met = played["next", "reward"].squeeze(-1) >= judged_by["achieved_reward"]  # of the stage's goal
+    in_stage = at_the_end(played, met).float().view(runs, -1)
     return torch.where(below.unsqueeze(1), in_stage, full)
 
 

@@ -84,6 +84,18 @@ def test_stages_with_goals_of_one_and_of_two_numbers_train_together() -> None:
     components.close()
 
 
+def test_a_goal_that_must_be_held_counts_at_the_end_of_its_stage_s_episodes() -> None:
+    """All positions are near enough, so it is held from the first step on."""
+    reach, throw = make_env("hand_v1").stages()
+    held = {**reach, "threshold": 100.0, "terminates": False}
+    components = build(small(task="hand_v1", algo="cher", curriculum=[held, throw], epochs=1))
+    rows = run(components, progress=False).rows
+    assert rows[0]["stage_success"] == 1.0
+    lasting = components.env.rollout(30, break_when_any_done=False)["next"]
+    assert (lasting["reward"] == 0).all()
+    assert not lasting["terminated"].any()
+
+
 def test_a_chain_is_climbed() -> None:
     options = {"length": 4, "stages": 2, "alternating": True}
     recipe = small(

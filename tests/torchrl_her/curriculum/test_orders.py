@@ -39,7 +39,8 @@ class Fixed(EpisodeStages):
 
 
 def shown(progress: EpisodeStages, num_envs: int, **options: int) -> TransformedEnv:
-    transforms = StateToObs(THREE, progress), ZeroPad(THREE, progress), StageOutcomes(progress)
+    seen = progress.curriculum, progress
+    transforms = StateToObs(*seen), ZeroPad(*seen), StageOutcomes(progress)
     return TransformedEnv(TinyEnv((num_envs,), **options), Compose(*transforms))
 
 
@@ -158,8 +159,10 @@ def test_an_episode_stays_in_its_stage() -> None:
     assert progress.next == []
 
 
-def test_it_is_told_how_the_episodes_of_each_stage_end() -> None:
+@pytest.mark.parametrize("terminates", [True, False])
+def test_it_is_told_how_the_episodes_of_each_stage_end(terminates: bool) -> None:
     progress = Fixed(0, 0, 1, 2, 0, 0, 0, 0, runs=2)
+    progress.curriculum = Curriculum([replace(own, terminates=terminates) for own in THREE.stages], 4)
     env = shown(progress, 4, horizon=1)  # the last stage's goal is near enough from the beginning
     act(env, env.reset(), 10.0, 0.0, 0.0, 0.0)
     assert progress.told == [([[2, 0, 0], [0, 1, 1]], [[1, 0, 0], [0, 0, 1]])]

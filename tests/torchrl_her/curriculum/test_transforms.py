@@ -258,6 +258,15 @@ def test_stages_below_have_the_rewards_that_they_are_given() -> None:
     assert act(env, [10.0, 0.0, 30.0, 0.0])["reward"].flatten().tolist() == [-1.5, -4.0, 7.0, 7.0]
 
 
+def test_a_stage_whose_goal_must_be_held_goes_on_there() -> None:
+    stages = [replace(stage, terminates=False) for stage in make_three().stages]
+    progress = at(Curriculum(stages, 4), 0)
+    env = TransformedEnv(TinyEnv((2,)), StateToObs(progress.curriculum, progress))
+    after = act(env, [10.0, 0.0])
+    assert after["reward"].flatten().tolist() == [0.0, -1.0]
+    assert not after["done"].any()
+
+
 def test_an_end_by_the_environments_own_goal_is_none() -> None:
     assert act(TinyEnv((2,)), [30.0, 0.0])["done"].flatten().tolist() == [True, False]
     env = wrap(TinyEnv((2,)), 0)

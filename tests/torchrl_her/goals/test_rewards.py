@@ -48,6 +48,12 @@ def test_reward_is_0_and_terminates_where_the_goal_is_achieved() -> None:
     assert terminated.tolist() == [[True], [False]]
 
 
+def test_an_achieved_goal_need_not_terminate() -> None:
+    reward, terminated = GoalReward(0.5, terminates=False)(torch.zeros(2, 1), goals([0.25], [2.0]))
+    assert reward.tolist() == [[0.0], [-1.0]]
+    assert terminated.tolist() == [[False], [False]]
+
+
 def test_reward_has_the_type_of_the_goals() -> None:
     reward, terminated = GoalReward(0.5)(torch.zeros(3, 2, dtype=torch.float64), torch.zeros(2))
     assert (reward.dtype, terminated.dtype) == (torch.float64, torch.bool)
