@@ -31,7 +31,8 @@ from ...envs.gym.walk import Walk
 from ..small import Refused, small
 from .tiny import needs_onnx, states, tiny_policy
 
-_FETCH, _PANDA = ("fetch_push", "fetch_pick_and_place"), ("panda_push", "panda_pick_and_place")
+_FETCH = ("fetch_push", "fetch_pick_and_place")
+_PANDA = ("panda_push", "panda_pick_and_place", "panda_stack")
 OTHERS = dict.fromkeys(_FETCH, "") | dict.fromkeys(_PANDA, "panda_gym")  # and modules that they need
 
 
@@ -121,14 +122,15 @@ def test_every_task_has_a_trained_policy() -> None:
 
 @pytest.mark.parametrize("name", OTHERS)
 def test_policies_of_other_packages_tasks_are_found_by_the_task_and_stay_at_its_goals(name: str) -> None:
-    """20 other episodes: of 0.95, 15 are five standard deviations below."""
+    """20 other episodes, with five standard deviations of room."""
     policy = load_policy(name)
     assert load_policy(policy.info.task).info == policy.info
-    assert policy.info.success > 0.9
+    said = policy.info.success
+    assert said > (0.8 if name == "panda_stack" else 0.9)
     if OTHERS[name] and find_spec(OTHERS[name]) is None:
         pytest.skip(f"needs {OTHERS[name]}")
     at_last, at_some = policy.measure(20, seed=99)
-    assert 0.75 <= at_last <= at_some
+    assert said - 5 * (said * (1 - said) / 20) ** 0.5 <= at_last <= at_some
 
 
 @pytest.mark.parametrize("task", TASKS)
