@@ -79,13 +79,22 @@ def _train(recipe: Recipe, folder: Path) -> recipes.RunResult:
         click.echo(f"chosen for this environment (auto): {' '.join(values)}")
     if (stages := components.recipe.curriculum.stages) and recipe.curriculum.stages is None:
         click.echo(
-            f"algo=auto chose a curriculum, since random actions seldom change the achieved goal: the first "
-            f"stage brings entries {stages[0]['achieved_goal']} of the observation to the achieved goal "
+            f"algo=auto chose a curriculum, since random actions {_reason(stages)} "
             "(algo=filtered_her trains without a curriculum)"
         )
     if recipe.learner.device == "auto":
         click.echo(f"learner.device=auto: {next(components.loss.parameters()).device}")
     return recipes.run(components, folder)
+
+
+def _reason(stages: Any) -> str:
+    if stages[0]["desired_goal"] == stages[-1]["desired_goal"]:
+        widths = " and ".join(f"{stage['threshold']:g}" for stage in stages[:-1])
+        return f"never achieve a goal: to come within {widths} of it counts, too"
+    entries = stages[0]["achieved_goal"]
+    return (
+        f"seldom change the achieved goal: the first stage brings entries {entries} of the observation to it"
+    )
 
 
 def _sweep(requested: dict[Path, Recipe], jobs: int | None, *, anew: bool) -> int:

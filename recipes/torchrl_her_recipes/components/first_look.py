@@ -29,6 +29,7 @@ _FUTURE = 16  # number of later goals of the episode that each transition is tri
 _DIGITS = 1e-4  # two rewards with at most this relative difference count as equal
 _TOUCH = 0.1  # quantile of the hand's distances in steps that move the object; nearer hands touch it
 _NEAR = 0.5  # a touching hand is nearer to the object than this share of its distance in other steps
+_WIDTHS = (5.0, 2.0)  # radii of the goals of stages before a task whose goals chance does not achieve
 _PAIRS = 32  # number of pairs of goals to estimate the distance below which a goal is achieved
 _HALVINGS = 20
 
@@ -55,6 +56,7 @@ class Facts:
         own_stages: whether the task has a curriculum of its own.
         stages: stages that ``propose_stages`` returns; empty if it proposes none, or if rewards depend on
             more than goals.
+        widths: stages that ``propose_widths`` returns; empty also if any episode achieved its goal.
         ends: rule that ends an episode at its goal, and what the environment did at goals; None if the
             environment has such a rule for all goals.
     """
@@ -74,6 +76,7 @@ class Facts:
     goal_inside: list[int]
     own_stages: bool
     stages: list[dict[str, Any]]
+    widths: list[dict[str, Any]]
     ends: GoalEnds | None
 
 
@@ -119,9 +122,12 @@ def _needed_stages(facts: Facts, auto: bool) -> list[dict[str, Any]] | None:
     """Returns stages for a task, the same for each seed; None if none are found or needed.
 
     A task in which episodes end in failures gets no stages: a failure says nothing about the goals of an
-    earlier stage. If ``algo`` is ``auto``, stages are needed only if chance seldom changes the achieved goal.
+    earlier stage. If ``algo`` is ``auto`` and chance often changes the achieved goal, only wider goals may be
+    needed.
     """
-    return None if facts.fallen > 0 or (auto and facts.moved >= _SELDOM) else facts.stages or None
+    if facts.fallen > 0:
+        return None
+    return (facts.widths if auto and facts.moved >= _SELDOM else facts.stages) or None
 
 
 def look_at(recipe: Recipe, *, steps: int = _STEPS, seconds: float | None = _SECONDS) -> Facts:
@@ -219,6 +225,7 @@ def _facts(
         goal_inside=_columns(observations, rows["desired_goal"].double()),
         own_stages=_has_stages(task),
         stages=[] if task.info_keys else propose_stages(rows, meets),
+        widths=[] if task.info_keys or any(achieved) else propose_widths(rows, meets),
         ends=getattr(task, "goal_ends", None),
     )
 
@@ -297,6 +304,31 @@ def propose_stages(rows: TensorDictBase, meets: Meets) -> list[dict[str, Any]]:
     around = float(gaps[best].min()) < radius / 2
     threshold = float(f"{radius / 2 if around else max(touch[best], radius):.2g}")
     return [{"name": "reach", **reach, "threshold": threshold}, {"name": "task", **task}]
+
+
+def propose_widths(rows: TensorDictBase, meets: Meets) -> list[dict[str, Any]]:
+    """Proposes stages with wider goals before a task whose goals are small and far away.
+
+    All stages have the same inputs. So an agent that learns them at once cannot tell them apart, and learns
+    the mean of their rewards: the nearer to the goal, the better. The achieved goal must be part of the
+    observation, and in nine of ten steps farther from the desired goal than the widest stage's threshold.
+
+    Args:
+        rows: transitions [n] of random actions.
+        meets: returns whether achieved goals [..., g] are the desired goals [..., g], as [...] of bool.
+
+    Returns:
+        Stages in the form of ``curriculum=FILE.yaml``; empty if the task does not need or allow them.
+    """
+    goal = rows["achieved_goal"].double()
+    place, radius = _columns(rows["observation"].double(), goal), _radius(rows, meets)
+    distance = float((goal - rows["desired_goal"].double()).norm(dim=-1).quantile(0.1))
+    if not place or radius is None or distance < _WIDTHS[0] * radius:
+        return []
+    task = {"observation": "observation", "achieved_goal": place, "desired_goal": "desired_goal"}
+    widths = [float(f"{times * radius:.2g}") for times in _WIDTHS]
+    wider = [{"name": f"within {w:g}", **task, "threshold": w, "terminates": False} for w in widths]
+    return [*wider, {"name": "task", **task}]
 
 
 def _radius(rows: TensorDictBase, meets: Meets) -> float | None:

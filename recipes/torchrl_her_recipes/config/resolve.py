@@ -28,7 +28,8 @@ class EnvFacts:
     Args:
         max_steps: largest number of steps in an episode.
         batched: whether all environments are stepped in one call, so that each additional one costs little.
-        stages: stages of a curriculum for a task whose achieved goal random actions seldom change; else None.
+        stages: stages of a curriculum for a task in which random actions seldom change the achieved goal, or
+            never achieve the desired one; else None.
         ends: value of ``task.options.termination`` that fits the environment; None if the task has no such
             option.
     """

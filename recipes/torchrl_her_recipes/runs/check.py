@@ -43,6 +43,8 @@ def advice(facts: Facts, recipe: Recipe, stages_file: str = "stages.yaml") -> li
     if facts.moved < _SELDOM:
         remedy = _remedy(facts, recipe.hindsight.algorithm, recipe.curriculum.stages, stages_file)
         lines.append(f"{_STILL.format(facts=facts, moved=_percent(facts.moved))} {remedy}")
+    if facts.widths and facts.moved >= _SELDOM and recipe.curriculum.stages is None:
+        lines.append("random actions never come near a goal: wider goals before the task's help (algo=auto)")
     if not facts.moved:
         lines.append("by the reward, achieved_goal never changed: does it hold what the goal is about?")
     if facts.fallen and recipe.task.failure == "environment":
