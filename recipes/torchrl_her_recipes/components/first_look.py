@@ -92,7 +92,8 @@ def resolved(recipe: Recipe) -> Recipe:
     needs_stages = auto or (recipe.hindsight.algorithm.curriculum and recipe.curriculum.stages is None)
     if not (auto_options(recipe) or ends_open(recipe.task) or needs_stages):
         return recipe
-    known = f"{recipe.task} {needs_stages} {auto}"
+    at_once = auto and recipe.weights.name == "none"  # stages that are learned one by one need no wider goals
+    known = f"{recipe.task} {needs_stages} {auto} {at_once}"
     if (facts := _FACTS.get(known)) is None:
         with closing(_watched(TaskEnvs.of(recipe)).make(1, [0])) as env:
             task = goal_env(env)
@@ -102,7 +103,7 @@ def resolved(recipe: Recipe) -> Recipe:
         open_ends = ends is not None and ends.env_ends is None and ends_open(recipe.task)
         if (needs_stages or open_ends) and not facts.batched:
             look = look_at(recipe.replace(seed=0), seconds=None)
-            stages = _needed_stages(look, auto) if needs_stages else None
+            stages = _needed_stages(look, auto, at_once) if needs_stages else None
             facts, ends = replace(facts, stages=stages), look.ends
         if ends is not None and ends_open(recipe.task):
             facts = replace(facts, ends=ends.found() or "never")
@@ -118,16 +119,18 @@ def _watched(envs: TaskEnvs) -> TaskEnvs:
     return replace(envs, task=replace(envs.task, options=options, failure="environment"))
 
 
-def _needed_stages(facts: Facts, auto: bool) -> list[dict[str, Any]] | None:
+def _needed_stages(facts: Facts, auto: bool, at_once: bool) -> list[dict[str, Any]] | None:
     """Returns stages for a task, the same for each seed; None if none are found or needed.
 
     A task in which episodes end in failures gets no stages: a failure says nothing about the goals of an
     earlier stage. If ``algo`` is ``auto`` and chance often changes the achieved goal, only wider goals may be
-    needed.
+    needed, and only if all stages are learned at once.
     """
     if facts.fallen > 0:
         return None
-    return (facts.widths if auto and facts.moved >= _SELDOM else facts.stages) or None
+    if auto and facts.moved >= _SELDOM:
+        return facts.widths if at_once and facts.widths else None
+    return facts.stages or None
 
 
 def look_at(recipe: Recipe, *, steps: int = _STEPS, seconds: float | None = _SECONDS) -> Facts:

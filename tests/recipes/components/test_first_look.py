@@ -160,14 +160,21 @@ def test_ends_without_goals_are_counted_in_whole_episodes(options: dict[str, Any
 
 
 @pytest.mark.parametrize(
-    ("options", "widths"),
-    [({"near": 0.0}, [5.0, 2.0]), ({"near": 1.0}, []), ({"near": 0.0, "lasts": 4}, [])],
-    ids=["far away", "within reach", "failures"],
+    ("task", "more", "widths"),
+    [
+        ({"near": 0.0}, {}, [5.0, 2.0]),
+        ({"near": 1.0}, {}, []),
+        ({"near": 0.0, "lasts": 4}, {}, []),
+        ({"near": 0.0}, {"weights": "rare"}, []),
+    ],
+    ids=["far away", "within reach", "failures", "weights, so one stage at a time"],
 )
-def test_small_goals_far_away_get_wider_ones_before(options: dict[str, Any], widths: list[float]) -> None:
-    recipe = resolved(make_recipe(task=TASK, **{"task.options": options}))
-    *wider, task = recipe.curriculum.stages or [{}]
+def test_small_goals_far_away_get_wider_ones_before(
+    task: dict[str, Any], more: dict[str, Any], widths: list[float]
+) -> None:
+    recipe = resolved(make_recipe(task=TASK, **{"task.options": task}, **more))
+    *wider, last = recipe.curriculum.stages or [{}]
     assert [stage["threshold"] for stage in wider] == pytest.approx(widths, rel=0.05)
     assert not any(stage["terminates"] for stage in wider)
-    assert all(stage[key] == task[key] for stage in wider for key in task if key != "name")
+    assert all(stage[key] == last[key] for stage in wider for key in last if key != "name")
     assert recipe.hindsight.algo == ("cher" if widths else "filtered_her")
