@@ -18,11 +18,18 @@ from torchrl_her_envs.common.goal_rules import GoalEnds, say_once
 from torchrl_her_recipes.components.envs import TaskEnvs, action_bounds, judging, task_reward
 from torchrl_her_recipes.config.options import AUTO
 from torchrl_her_recipes.config.recipe import Recipe
-from torchrl_her_recipes.config.resolve import TERMINATION, EnvFacts, auto_options, ends_open, resolve
+from torchrl_her_recipes.config.resolve import (
+    TERMINATION,
+    EnvFacts,
+    auto_options,
+    ends_open,
+    resolve,
+    trains_at_once,
+)
 
 _AT_ONCE = 8
 _STEPS = 3_000
-_SELDOM = 0.5  # goals change seldom if a smaller share of episodes changes them; Panda: 0.15 to 0.35
+SELDOM = 0.5  # goals change seldom if a smaller share of episodes changes them; Panda: 0.15 to 0.35
 _FACTS: dict[str, EnvFacts] = {}  # cached facts of each task
 _SECONDS = 20.0  # seconds after which no further episodes begin
 _FUTURE = 16  # number of later goals of the episode that each transition is tried with
@@ -56,7 +63,7 @@ class Facts:
         own_stages: whether the task has a curriculum of its own.
         stages: stages that ``propose_stages`` returns; empty if it proposes none, or if rewards depend on
             more than goals.
-        widths: stages that ``propose_widths`` returns; empty also if any episode achieved its goal.
+        widths: stages that ``propose_widths`` returns; empty also if an episode achieved its goal or failed.
         ends: rule that ends an episode at its goal, and what the environment did at goals; None if the
             environment has such a rule for all goals.
     """
@@ -92,7 +99,7 @@ def resolved(recipe: Recipe) -> Recipe:
     needs_stages = auto or (recipe.hindsight.algorithm.curriculum and recipe.curriculum.stages is None)
     if not (auto_options(recipe) or ends_open(recipe.task) or needs_stages):
         return recipe
-    at_once = auto and recipe.weights.name == "none"  # stages that are learned one by one need no wider goals
+    at_once = trains_at_once(recipe)
     known = f"{recipe.task} {needs_stages} {auto} {at_once}"
     if (facts := _FACTS.get(known)) is None:
         with closing(_watched(TaskEnvs.of(recipe)).make(1, [0])) as env:
@@ -128,9 +135,9 @@ def _needed_stages(facts: Facts, auto: bool, at_once: bool) -> list[dict[str, An
     """
     if facts.fallen > 0:
         return None
-    if auto and facts.moved >= _SELDOM:
-        return facts.widths if at_once and facts.widths else None
-    return facts.stages or None
+    if not auto or facts.moved < SELDOM:
+        return facts.stages or None
+    return (facts.widths or None) if at_once else None
 
 
 def look_at(recipe: Recipe, *, steps: int = _STEPS, seconds: float | None = _SECONDS) -> Facts:
@@ -228,7 +235,7 @@ def _facts(
         goal_inside=_columns(observations, rows["desired_goal"].double()),
         own_stages=_has_stages(task),
         stages=[] if task.info_keys else propose_stages(rows, meets),
-        widths=[] if task.info_keys or any(achieved) else propose_widths(rows, meets),
+        widths=[] if task.info_keys or any(achieved) or any(fallen) else propose_widths(rows, meets),
         ends=getattr(task, "goal_ends", None),
     )
 

@@ -96,6 +96,11 @@ def ends_open(task: TaskConfig) -> bool:
     return TERMINATION in known and (task.options or {}).get(TERMINATION, AUTO) == AUTO
 
 
+def trains_at_once(recipe: Recipe) -> bool:
+    """Returns whether ``algo=auto`` trains all stages at once: weights compare goals of one stage only."""
+    return recipe.weights.name == "none"
+
+
 def resolve(recipe: Recipe, facts: EnvFacts) -> Recipe:
     """Returns a copy of a recipe with a value for each option that was ``auto``.
 
@@ -112,7 +117,6 @@ def resolve(recipe: Recipe, facts: EnvFacts) -> Recipe:
         values = {f"{group}.{name}": _VALUES[name](recipe, facts)}
         if name == "algo" and facts.stages:
             values |= {"stages": facts.stages, "guided_share": 0.5, "guided_per": "step"}
-            # Weights compare the goals of one stage only, so weighted goals need one stage at a time.
-            values |= _AT_ONCE if recipe.weights.name == "none" else {"stage_epochs": _STAGE_EPOCHS}
+            values |= _AT_ONCE if trains_at_once(recipe) else {"stage_epochs": _STAGE_EPOCHS}
         recipe = recipe.replace(**values)
     return recipe

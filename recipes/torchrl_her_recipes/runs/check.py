@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from torchrl_her_recipes.components.first_look import Facts, resolved
+from torchrl_her_recipes.components.first_look import SELDOM, Facts, resolved
 from torchrl_her_recipes.config.algorithms import Algorithm
 from torchrl_her_recipes.config.recipe import Recipe
 
-_SELDOM = 0.5  # achieved goals change seldom if a smaller fraction of the episodes changes them
 _UNLIKE = 100  # ratio of scales above which observations need normalization
 _SLOW = 5e-3  # seconds of a step above which an environment is slow; a gradient step takes about as long
 _MOSTLY = 0.5  # fraction of achieved goals above which success says little about learning
@@ -40,11 +39,14 @@ def advice(facts: Facts, recipe: Recipe, stages_file: str = "stages.yaml") -> li
             f"entries {facts.goal_inside[0]} to {facts.goal_inside[-1]} of the observation are the desired "
             "goal, but relabeling does not change the observation: leave them out"
         )
-    if facts.moved < _SELDOM:
+    if facts.moved < SELDOM:
         remedy = _remedy(facts, recipe.hindsight.algorithm, recipe.curriculum.stages, stages_file)
         lines.append(f"{_STILL.format(facts=facts, moved=_percent(facts.moved))} {remedy}")
-    if facts.widths and facts.moved >= _SELDOM and recipe.curriculum.stages is None:
-        lines.append("random actions never come near a goal: wider goals before the task's help (algo=auto)")
+    elif facts.widths and recipe.curriculum.stages is None:
+        lines.append(
+            "random actions never come near a goal: wider goals before the task's help "
+            "(algo=auto weights=none)"
+        )
     if not facts.moved:
         lines.append("by the reward, achieved_goal never changed: does it hold what the goal is about?")
     if facts.fallen and recipe.task.failure == "environment":
