@@ -36,7 +36,7 @@ _FUTURE = 16  # number of later goals of the episode that each transition is tri
 _DIGITS = 1e-4  # two rewards with at most this relative difference count as equal
 _TOUCH = 0.1  # quantile of the hand's distances in steps that move the object; nearer hands touch it
 _NEAR = 0.5  # a touching hand is nearer to the object than this share of its distance in other steps
-_WIDTHS = (5.0, 2.0)  # radii of the goals of stages before a task whose goals chance does not achieve
+_WIDTHS = (5.0, 2.0, 1.4)  # radii of the goals of stages before a task whose goals chance does not achieve
 _PAIRS = 32  # number of pairs of goals to estimate the distance below which a goal is achieved
 _HALVINGS = 20
 

@@ -162,7 +162,7 @@ def test_ends_without_goals_are_counted_in_whole_episodes(options: dict[str, Any
 @pytest.mark.parametrize(
     ("task", "more", "widths"),
     [
-        ({"near": 0.0}, {}, [5.0, 2.0]),
+        ({"near": 0.0}, {}, [5.0, 2.0, 1.4]),
         ({"near": 1.0}, {}, []),
         ({"near": 0.0, "lasts": 4}, {}, []),
         ({"near": 0.0}, {"weights": "rare"}, []),
