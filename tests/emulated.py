@@ -207,6 +207,9 @@ def _problem(
         return "a generator on another device"
     if func in _ON_THE_CPU_ONLY and there[0]:
         return "a tensor on the device"
+    copied = func in (Tensor.to, Tensor.copy_) and after and not there[-1]
+    if copied and torch.cuda.is_current_stream_capturing():
+        return "a tensor on the CPU, while a graph is recorded"
     if func in _MOVES or func in _FACTORIES or all(there) or not any(there):
         return ""
     if func is Tensor.__setitem__ and not any(isinstance(own, Tensor) for own in tree_leaves(args[1])):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -63,6 +63,14 @@ class StochasticActor(ProbabilisticActor):
     @generators.setter
     def generators(self, generators: Sequence[torch.Generator | None] | None) -> None:
         self.noise = RunNoise(generators)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> StochasticActor:
+        """Moves the bounds of actions, too: TorchRL would copy them in each step, which no CUDA graph can."""
+        bounds = self[-1].distribution_kwargs
+        self[-1].distribution_kwargs = {
+            name: fn(value) if isinstance(value, Tensor) else value for name, value in bounds.items()
+        }
+        return super()._apply(fn, recurse)
 
     def forward(self, tensordict: TensorDictBase, *args: Any, **kwargs: Any) -> TensorDictBase:
         """Writes the action of each row [R * E, ...]: drawn, or greedy if exploration is switched off."""

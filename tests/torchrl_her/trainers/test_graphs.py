@@ -57,7 +57,7 @@ def parts(
 ) -> dict[str, Any]:
     """A loss, its optimizer and its targets, always with the same weights and random numbers."""
     torch.manual_seed(0)
-    spec = Bounded(-1.0, 1.0, (3,), device=device)
+    spec = Bounded(-1.0, 1.0, (3,))  # on the CPU, as that of an environment
     outputs = 5 if make is make_tqc_loss else 1
     stochastic = make in (make_sac_loss, make_tqc_loss)
     actor = make_stochastic_actor((4, 2), spec, runs=runs) if stochastic else make_actor((4, 2), 3, runs=runs)
@@ -70,7 +70,7 @@ def parts(
     if stochastic:
         actor.generators = generators
     elif make is make_td3_loss:
-        options |= {"generators": generators, "action_spec": spec}
+        options |= {"generators": generators, "action_spec": spec.to(device)}
     loss = make(actor.to(device), critic.to(device), **options).to(device)
     optimizer = torch.optim.Adam(loss.parameters(), lr=1e-2)
     target = make_target_updater(loss, tau=0.1, hard_interval=0)
