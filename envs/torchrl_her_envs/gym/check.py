@@ -108,13 +108,14 @@ def _cannot_make(id: str, error: Exception) -> str:
 
 
 def _register_robotics(id: str) -> str:
-    """Registers the environments of gymnasium-robotics; returns a hint if they are not installed."""
+    """Registers the environments of gymnasium-robotics; returns a hint if they cannot be imported."""
     if ":" not in id and id not in gymnasium.registry:
         try:
             with redirect_stderr(io.StringIO()):  # hides a notice about Adroit tasks, which have no goals
                 importlib.import_module("gymnasium_robotics")
-        except ModuleNotFoundError:
-            return " (gymnasium-robotics is not installed: pip install '.[robotics]')"
+        except ModuleNotFoundError as error:
+            found = "is not installed" if error.name == "gymnasium_robotics" else f"fails: {_line(error)}"
+            return f" (gymnasium-robotics {found}: pip install '.[robotics]')"
     return ""
 
 

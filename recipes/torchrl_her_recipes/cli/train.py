@@ -89,8 +89,8 @@ def _train(recipe: Recipe, folder: Path) -> recipes.RunResult:
 
 def _reason(stages: Any) -> str:
     if stages[0]["desired_goal"] == stages[-1]["desired_goal"]:
-        widths = " and ".join(f"{stage['threshold']:g}" for stage in stages[:-1])
-        return f"never achieve a goal: to come within {widths} of it counts, too"
+        *wide, least = (f"{stage['threshold']:g}" for stage in stages[:-1])
+        return f"never achieve a goal: to come within {', '.join(wide)} and {least} of it counts, too"
     entries = stages[0]["achieved_goal"]
     return (
         f"seldom change the achieved goal: the first stage brings entries {entries} of the observation to it"

@@ -55,12 +55,16 @@ def test_a_module_that_is_not_there_is_named() -> None:
         make_gym_env("no_such_module:Env-v0")
 
 
-def test_what_to_install_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("absent", "said"),
+    [("gymnasium_robotics", "is not installed"), ("glfw", "fails: No module named 'glfw'")],
+)
+def test_what_to_install_is_said(absent: str, said: str, monkeypatch: pytest.MonkeyPatch) -> None:
     def missing(name: str) -> None:
-        raise ModuleNotFoundError(f"No module named {name!r}")
+        raise ModuleNotFoundError(f"No module named {absent!r}", name=absent)
 
     monkeypatch.setattr(importlib, "import_module", missing)
-    with pytest.raises(ValueError, match=r"pip install '.\[robotics\]'"):
+    with pytest.raises(ValueError, match=rf"\(gymnasium-robotics {said}: pip install '.\[robotics\]'\)"):
         make_gym_env("FetchStand-v4")
 
 
