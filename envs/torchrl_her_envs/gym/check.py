@@ -297,14 +297,27 @@ def find_achieved_reward(
     return float(least.min()) if np.allclose(least, least.min(), rtol=1e-3) else None
 
 
-def try_steps(env: gymnasium.Env, layout: Layout) -> Trial:
-    """Plays episodes of random actions, the same ones in each call."""
+def try_steps(env: gymnasium.Env, layout: Layout, *, at_goals: bool = False) -> Trial:
+    """Plays episodes of random actions, the same ones in each call.
+
+    Args:
+        env: environment to be played.
+        layout: layout of its goals.
+
+    Keyword Args:
+        at_goals: whether each step begins at its goal: the desired goal is set to the achieved one, if the
+            environment or its ``task`` has an array ``goal`` (gymnasium-robotics and panda-gym do).
+    """
     env.action_space.seed(0)
+    owners: list[Any] = [env.unwrapped, getattr(env.unwrapped, "task", None)] if at_goals else []
     rows: list[tuple[Any, ...]] = []
     done = True
     for step in range(_TRIED_STEPS):
         if done:
-            env.reset(seed=step)
+            observation, _ = env.reset(seed=step)
+        for owner in owners:
+            if isinstance(getattr(owner, "goal", None), np.ndarray):
+                owner.goal = np.array(observation["achieved_goal"])
         observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
         done = terminated or truncated
         goals = (layout.flatten(observation[key]) for key in KEYS[1:])

@@ -45,6 +45,7 @@ from torchrl_her_envs.gym.check import (
     REWARD,
     SUCCESS,
     TERMINATED,
+    Trial,
     check_goal_env,
     check_methods,
     coarse_goals,
@@ -170,9 +171,10 @@ class GymGoalEnv(GoalEnv, GymWrapper):
       steps with the reward of an achieved goal.
     - ``"reward"``: steps with the reward of an achieved goal, for real and virtual goals.
     - ``"never"``: no steps. An episode that the environment ends at its goal is ``truncated``.
-    - ``"auto"``: chosen after 100 steps of random actions. ``"success"`` (or ``"reward"`` without
-      ``is_success``) if the environment ended an episode at an achieved goal; ``"never"`` if it continued
-      there, or if no goal was achieved. The choice is logged.
+    - ``"auto"``: chosen after 100 steps of random actions, and 100 more from achieved goals if these
+      achieved none. ``"success"`` (or ``"reward"`` without ``is_success``) if the environment ended an
+      episode at an achieved goal; ``"never"`` if it continued there, or if no goal was achieved. The choice
+      is logged.
     - ``"watch"``: the environment ends episodes as it does by itself, and ``goal_ends`` counts the episodes
       that it ended or continued at their goals.
 
@@ -272,15 +274,22 @@ class GymGoalEnv(GoalEnv, GymWrapper):
             self._terminated_of = self._function(TERMINATED, goals, info)
             env_ends = bool(self._terminated_of.tried.any())
         self.goal_ends = GoalEnds(id, env_ends=env_ends, tells_success=trial.success is not None)
-        self.goal_ends.apply(
-            met if trial.success is None else trial.success, trial.terminated, trial.truncated
-        )
+        self._count_ends(trial)
+        if self.goal_ends.found() is None:
+            self._count_ends(try_steps(env, layout, at_goals=True))
         self.goal_ends.decide(termination)
         if trial.success is not None:
             shape = (*self.batch_size, 1)
             self.observation_spec[SUCCESS] = Binary(n=1, shape=shape, dtype=torch.bool)
         if info:
             self.observation_spec[INFO] = infos.spec(self.batch_size[0])
+
+    def _count_ends(self, trial: Trial) -> None:
+        met = trial.success
+        if met is None:
+            rewards = self._reward_of(trial.achieved, trial.desired, self._infos.stack(trial.infos))
+            met = rewards >= self.achieved_reward
+        self.goal_ends.apply(met, trial.terminated, trial.truncated)
 
     @property
     def ends(self) -> Ends:

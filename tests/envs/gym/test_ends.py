@@ -45,8 +45,11 @@ def steps(env: GymGoalEnv, count: int = 60) -> Any:
         (
             {"unseen": True},
             "never",
-            "no goal was achieved in 100 random steps, .* choose task.options.termination=success",
+            "no goal was achieved in 200 random steps, .* choose task.options.termination=success",
         ),
+        ({"unseen": True, "keeps": True}, "success", "in 200 random steps it ended where a goal was"),
+        ({"unseen": True, "keeps": True, "stops": False}, "never", "it went on after a goal was achieved"),
+        ({"unseen": True, "keeps": True, "tells": False}, "reward", "ended where a goal was achieved"),
         ({"unseen": True, "tells": False}, "never", "if they do, choose task.options.termination=reward"),
     ],
 )

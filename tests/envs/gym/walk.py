@@ -81,7 +81,7 @@ class Walk(gymnasium.Env):
 
     def _show(self) -> dict[str, np.ndarray]:
         places = {"observation": self.place, "achieved_goal": self.place, "desired_goal": self.goal}
-        return {key: np.array([place]) for key, place in places.items()}
+        return {key: np.ravel(place) for key, place in places.items()}
 
 
 class Plain(Walk):
@@ -90,7 +90,8 @@ class Plain(Walk):
     Args:
         stops: whether a step at the goal terminates the episode.
         tells: whether info has is_success.
-        far: how far goals are away: from 10 on, no random walk gets there.
+        unseen: whether goals are so far away that no random walk gets there.
+        keeps: whether the goal is an array, which can be set to another.
         falls: whether the episode terminates in place 0.
         dense: whether the reward is the distance.
         cost: of each step, which compute_reward does not know.
@@ -102,6 +103,7 @@ class Plain(Walk):
         stops: bool = True,
         tells: bool = True,
         unseen: bool = False,
+        keeps: bool = False,
         falls: bool = False,
         dense: bool = False,
         cost: float = 0.0,
@@ -110,20 +112,20 @@ class Plain(Walk):
     ) -> None:
         super().__init__(without="compute_terminated", form=form, render_mode=render_mode)
         self.stops, self.tells, self.falls, self.dense, self.unseen = stops, tells, falls, dense, unseen
-        self.cost = cost
+        self.cost, self.keeps = cost, keeps
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         super().reset(seed=seed)
         if self.unseen:
-            self.goal = 9.0
+            self.goal = np.array([9.0]) if self.keeps else 9.0
         if self.falls:
             self.place, self.goal = 2.0, 4.0
         return self._show(), {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         self.place = float(np.clip(self.place + (1 if np.ravel(action)[0] > 0 else -1), 0, 4))
-        met = self.place == self.goal
-        reward = self.compute_reward(np.array([self.place]), np.array([self.goal]), {})
+        met = bool(self.place == self.goal)
+        reward = self.compute_reward(np.array([self.place]), np.ravel(self.goal), {})
         ends = (self.stops and met) or (self.falls and self.place == 0)
         return self._show(), float(reward) - self.cost, ends, False, {"is_success": met} if self.tells else {}
 

@@ -100,7 +100,7 @@ def never_looks(monkeypatch: pytest.MonkeyPatch) -> None:
         ({}, "reward", "random steps it ended where a goal was achieved"),
         ({"cost": 0.25}, "reward", "ended where a goal was achieved"),
         ({"stops": False}, "never", "it went on after a goal was achieved"),
-        ({"near": 0.0}, "never", "no goal was achieved in 3,140 random steps"),
+        ({"near": 0.0}, "never", "no goal was achieved in 3,240 random steps"),
         ({"own": True}, "own", None),
         ({"own": False, "stops": False}, "never", None),
     ],
@@ -116,10 +116,10 @@ def test_what_ends_episodes_is_found_by_many_steps_and_said_once(
     assert line is None or line in lines[0]
 
 
-def test_a_hundred_steps_show_too_little(said: pytest.LogCaptureFixture) -> None:
+def test_two_hundred_steps_show_too_little(said: pytest.LogCaptureFixture) -> None:
     env = make_env(TASK)
     assert env.ends == "never"
-    assert "no goal was achieved in 100 random steps" in said.records[0].getMessage()
+    assert "no goal was achieved in 200 random steps" in said.records[0].getMessage()
 
 
 def test_a_run_keeps_what_was_found_and_nobody_looks_again(
