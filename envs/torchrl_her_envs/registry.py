@@ -200,6 +200,7 @@ def _gym_spec(id: str) -> TaskSpec:
             "termination": "auto",
             "achieved_reward": None,
             "info_keys": (),
+            "shaping": None,
         },
         takes_others=True,
         for_pictures={"pictures": True},

@@ -25,7 +25,7 @@ REWARD, TERMINATED = "compute_reward", "compute_terminated"
 SUCCESS = "is_success"
 # Options of make_gym_env that every environment takes.
 _OUR_OPTIONS = (
-    *("max_steps", "parallel", "termination", "achieved_reward", "info_keys"),
+    *("max_steps", "parallel", "termination", "achieved_reward", "info_keys", "shaping"),
     *(f"{key}_key" for key in KEYS),
     "pictures",
 )

@@ -23,6 +23,7 @@ from torchrl_her_envs.common.goal_env import (
     Names,
     bounded_actions,
     needs_info,
+    reward_range,
 )
 from torchrl_her_envs.common.goal_rules import (
     Ends,
@@ -60,7 +61,7 @@ from torchrl_her_envs.gym.check import (
 )
 from torchrl_her_envs.gym.drawing import PICTURES, cannot_draw, choose_renderer, draws
 from torchrl_her_envs.gym.fetch import fetch_names, fetch_stages
-from torchrl_her_envs.gym.goal_functions import GoalFunction
+from torchrl_her_envs.gym.goal_functions import GoalFunction, ShapedReward
 from torchrl_her_envs.gym.infos import Infos
 from torchrl_her_envs.gym.layout import Layout
 from torchrl_her_envs.gym.quiet import make_quietly
@@ -76,6 +77,7 @@ def make_gym_env(
     termination: str = "auto",
     achieved_reward: float | None = None,
     info_keys: Sequence[str] = (),
+    shaping: Sequence[float] | None = None,
     observation_key: Names = "observation",
     achieved_goal_key: Names = "achieved_goal",
     desired_goal_key: Names = "desired_goal",
@@ -97,6 +99,7 @@ def make_gym_env(
         achieved_reward: the least reward at which a goal counts as achieved, for dense rewards; if None, the
             least reward at which the environment's method ``_is_success`` is true.
         info_keys: keys of ``info`` that ``compute_reward`` reads, see :class:`GymGoalEnv`.
+        shaping: two distances between which a missed goal's reward grows, see :class:`GymGoalEnv`.
         observation_key, achieved_goal_key, desired_goal_key: the environment's names of these entries. The
             entries of a list are joined in order; ``compute_reward`` gets them as a dictionary.
         pictures: whether to make environments with ``render_mode="rgb_array"``, if they have that mode.
@@ -147,6 +150,7 @@ def make_gym_env(
             termination=termination,
             achieved_reward=achieved_reward,
             info_keys=info_keys,
+            shaping=shaping,
         )
         opened.pop_all()  # from here on, GymGoalEnv.close closes all environments
     return env
@@ -196,6 +200,9 @@ class GymGoalEnv(GoalEnv, GymWrapper):
             None.
         info_keys: keys of ``info`` that its functions read. The info of every step must have them, as numbers
             or arrays of numbers.
+        shaping: the nearer and the farther of two distances between which a missed goal's reward grows to
+            that of an achieved goal, see :class:`~torchrl_her_envs.gym.goal_functions.ShapedReward`; None for
+            the environment's own sparse reward.
 
     Attributes:
         goal_ends: rule for the ends of episodes at goals, and counts of what the environment did there.
@@ -206,8 +213,9 @@ class GymGoalEnv(GoalEnv, GymWrapper):
 
     Raises:
         ValueError: environments cannot be shared out among the seeds, an achieved goal gives no more
-            reward than a missed one, the reward is dense and no ``achieved_reward`` is given or found, or
-            ``termination`` is unknown or needs what the environment lacks.
+            reward than a missed one, the reward is dense and no ``achieved_reward`` is given or found,
+            ``shaping`` is not two growing distances, or ``termination`` is unknown or needs what the
+            environment lacks.
     """
 
     def __init__(
@@ -219,8 +227,10 @@ class GymGoalEnv(GoalEnv, GymWrapper):
         termination: str = "auto",
         achieved_reward: float | None = None,
         info_keys: Sequence[str] = (),
+        shaping: Sequence[float] | None = None,
         **kwargs: Any,
     ) -> None:
+        self._reward_of: GoalFunction | ShapedReward
         shown = shown_of(reference_env.observation_space)
         id = spec_of(reference_env).id
         self._layouts = {key: Layout(shown[key], f"{id}: {key}") for key in KEYS}
@@ -228,6 +238,9 @@ class GymGoalEnv(GoalEnv, GymWrapper):
         self._reference_env = reference_env
         self.max_steps = spec_of(reference_env).max_episode_steps or 0
         self._try_out(check_termination(termination), achieved_reward, info_keys)
+        if shaping is not None:
+            self._reward_of = ShapedReward(self._reward_of, *reward_range(self), shaping)
+            self.dense_reward = True
         self.set_seeds(as_seeds(seed))
 
     def _try_out(
@@ -239,20 +252,20 @@ class GymGoalEnv(GoalEnv, GymWrapper):
         self._infos = infos = Infos(info_keys, seen, id)
         goals = goals_to_try(env, layout)
         info = infos.stack([seen[row % len(seen)] for row in range(len(goals[0]) if seen else 0)])
-        self._reward_of = self._function(REWARD, goals, info)
+        reward_of = self._reward_of = self._function(REWARD, goals, info)
         trial = try_steps(env, layout)
         warn_once(coarse_goals(id, trial.achieved))
-        check_stateless(id, self._reward_of.tried, self._reward_of(*goals, info))
+        check_stateless(id, reward_of.tried, reward_of(*goals, info))
         one, other = trial.pairs()
         pairs, stepped = (trial.achieved[one], trial.desired[other]), infos.stack(trial.infos)
         paired = {key: entries[one] for key, entries in stepped.items()}
-        others = np.concatenate([self._reward_of.tried[EPISODES:], self._reward_of(*pairs, paired)])
-        equal = float(self._reward_of.tried[:EPISODES].min())
+        others = np.concatenate([reward_of.tried[EPISODES:], reward_of(*pairs, paired)])
+        equal = float(reward_of.tried[:EPISODES].min())
         if info:
-            of_equal_goals = self._reward_of(trial.desired, trial.desired, stepped)
+            of_equal_goals = reward_of(trial.desired, trial.desired, stepped)
             equal = equal_with_info(id, of_equal_goals, others, achieved_reward)
         elif achieved_reward is None and is_dense(equal, others):
-            achieved_reward = find_achieved_reward(env, layout, self._reward_of, *pairs)
+            achieved_reward = find_achieved_reward(env, layout, reward_of, *pairs)
             if achieved_reward is not None:
                 say_once(
                     f"{id} has a dense reward: goals count as achieved where _is_success becomes true "
@@ -261,12 +274,10 @@ class GymGoalEnv(GoalEnv, GymWrapper):
         self.missed_reward, self.achieved_reward, self.dense_reward = check_rewards(
             id, equal, others, achieved_reward
         )
-        computed = self._reward_of(trial.achieved, trial.desired, stepped)
+        computed = reward_of(trial.achieved, trial.desired, stepped)
         met = computed >= self.achieved_reward
         went_on = ~trial.terminated | met  # without failures, whose cost is not computed
-        warn_once(
-            self._reward_of.hint(info) or check_same_rewards(id, trial.reward[went_on], computed[went_on])
-        )
+        warn_once(reward_of.hint(info) or check_same_rewards(id, trial.reward[went_on], computed[went_on]))
         env_ends = None
         if termination in ("auto", "own", "watch") and has_compute_terminated(
             env, *(layout.unflatten(goal[0]) for goal in goals)
@@ -403,7 +414,7 @@ class GymGoalEnv(GoalEnv, GymWrapper):
 
     def _ask(
         self,
-        function: GoalFunction,
+        function: GoalFunction | ShapedReward,
         achieved_goal: Tensor,
         desired_goal: Tensor,
         info: TensorDictBase | None,
@@ -462,6 +473,8 @@ class GymGoalEnv(GoalEnv, GymWrapper):
         if SUCCESS in info:
             shown = {**shown, SUCCESS: info[SUCCESS]}
         shown = {**shown, INFO: self._infos.of_batch(info, len(reward))}
+        if isinstance(self._reward_of, ShapedReward):
+            reward = reward + self._reward_of.bonus(*self._goals(shown), shown[INFO])
         if self.ends != "own":
             met = self._met(shown)
             terminated, truncated = self.goal_ends.apply(met, terminated, truncated)
@@ -471,8 +484,11 @@ class GymGoalEnv(GoalEnv, GymWrapper):
         """Returns a mask [N] of environments that achieve their goals, by ``is_success`` or the reward."""
         if self.goal_ends.asks_success:
             return np.asarray(shown.get(SUCCESS, np.zeros(self.batch_size))).astype(np.bool_)
+        return self._reward_of(*self._goals(shown), shown[INFO]) >= self.achieved_reward
+
+    def _goals(self, shown: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
         achieved, desired = (self._layouts[key].flatten(shown[key]) for key in KEYS[1:])
-        return self._reward_of(achieved, desired, shown[INFO]) >= self.achieved_reward
+        return achieved, desired
 
     def _set_seed(self, seed: int | None) -> None:
         self.set_seeds([seed or 0])

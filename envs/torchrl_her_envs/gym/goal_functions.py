@@ -1,8 +1,8 @@
-"""Calls the functions of gymnasium's GoalEnv with batches of goals, even those written for one pair."""
+"""Calls the functions of gymnasium's GoalEnv with batches of goals, and shapes sparse rewards."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -12,6 +12,7 @@ Form = Literal["pair", "rows", "rows and infos"]
 Function = Callable[[np.ndarray, np.ndarray, Any], Any]
 Info = Mapping[str, np.ndarray]  # entries [B, ...] of B infos
 _NOTHING: Info = {}
+_MOST = 0.99  # largest share of the reward of an achieved goal that a missed one can get
 
 
 class _OneInfo(dict[str, Any]):
@@ -163,3 +164,42 @@ class GoalFunction:
             if answer.size in (1, len(achieved)) and np.allclose(answer.reshape(-1), self.tried):
                 return "one" if answer.size == 1 else "batch"
         return "loop"
+
+
+class ShapedReward:
+    """A sparse reward in which nearly achieved goals get a share of the reward of achieved ones.
+
+    The share grows from 0 at the distance ``far`` to 1 at ``near``, with the logarithm of the distance: each
+    halving gains the same. So it pays to be more precise, even far from precise enough.
+
+    Args:
+        function: maps (achieved, desired) goals [B, g] and their info to rewards [B].
+        missed, achieved: rewards of a missed and of an achieved goal.
+        shaping: the distances ``near`` and ``far`` between goals, in their unit.
+
+    Raises:
+        ValueError: ``shaping`` is not two distances, 0 < near < far.
+
+    Example:
+        >>> sparse = lambda achieved, desired, info: -1.0 + (abs(achieved - desired) < 1)[:, 0]
+        >>> shaped = ShapedReward(sparse, -1.0, 0.0, (1.0, 100.0))
+        >>> shaped(np.array([[0.5], [10.0], [300.0]]), np.zeros((3, 1))).tolist()
+        [0.0, -0.5, -1.0]
+    """
+
+    def __init__(self, function: Function, missed: float, achieved: float, shaping: Sequence[float]) -> None:
+        if np.shape(shaping) != (2,) or not 0 < shaping[0] < shaping[1] < np.inf:
+            raise ValueError(f"shaping must be two distances, 0 < near < far, got {shaping}")
+        self._function, self._achieved, self._gain = function, achieved, achieved - missed
+        self._near, self._far = shaping
+
+    def __call__(self, achieved: np.ndarray, desired: np.ndarray, info: Info = _NOTHING) -> np.ndarray:
+        """Returns the rewards [B] of goals [B, g], with the entries [B, ...] of their infos."""
+        return self._function(achieved, desired, info) + self.bonus(achieved, desired, info)
+
+    def bonus(self, achieved: np.ndarray, desired: np.ndarray, info: Info = _NOTHING) -> np.ndarray:
+        """Returns what is added to the rewards [B] of goals [B, g]: 0 where they are achieved."""
+        missed = self._function(achieved, desired, info) < self._achieved
+        distance = np.linalg.norm(achieved - desired, axis=-1).clip(self._near, self._far)
+        share = np.log(self._far / distance) / np.log(self._far / self._near)
+        return self._gain * np.where(missed, share.clip(0, _MOST), 0)

@@ -20,7 +20,7 @@ from torchrl_her_recipes.cli.train_options import (
 )
 from torchrl_her_recipes.config.imports import imported_modules, needs_permission
 from torchrl_her_recipes.config.recipe import Recipe, check_extending
-from torchrl_her_recipes.config.resolve import auto_options
+from torchrl_her_recipes.config.resolve import SHAPING, auto_options
 
 
 @click.command(cls=OptionsCommand, short_help="train, or resume a run")
@@ -79,22 +79,20 @@ def _train(recipe: Recipe, folder: Path) -> recipes.RunResult:
         click.echo(f"chosen for this environment (auto): {' '.join(values)}")
     if (stages := components.recipe.curriculum.stages) and recipe.curriculum.stages is None:
         click.echo(
-            f"algo=auto chose a curriculum, since random actions {_reason(stages)} "
-            "(algo=filtered_her trains without a curriculum)"
+            "algo=auto chose a curriculum, since random actions seldom change the achieved goal: the first "
+            f"stage brings entries {stages[0]['achieved_goal']} of the observation to it (algo=filtered_her "
+            "trains without a curriculum)"
+        )
+    near_far = (components.recipe.task.options or {}).get(SHAPING)
+    if near_far and near_far != (recipe.task.options or {}).get(SHAPING):
+        click.echo(
+            f"algo=auto chose task.options.shaping={near_far}, since random actions never come near a goal: "
+            "missing it by less than the second distance has a higher reward, the nearer the higher "
+            "(algo=filtered_her trains without)"
         )
     if recipe.learner.device == "auto":
         click.echo(f"learner.device=auto: {next(components.loss.parameters()).device}")
     return recipes.run(components, folder)
-
-
-def _reason(stages: Any) -> str:
-    if stages[0]["desired_goal"] == stages[-1]["desired_goal"]:
-        *wide, least = (f"{stage['threshold']:g}" for stage in stages[:-1])
-        return f"never achieve a goal: to come within {', '.join(wide)} and {least} of it counts, too"
-    entries = stages[0]["achieved_goal"]
-    return (
-        f"seldom change the achieved goal: the first stage brings entries {entries} of the observation to it"
-    )
 
 
 def _sweep(requested: dict[Path, Recipe], jobs: int | None, *, anew: bool) -> int:

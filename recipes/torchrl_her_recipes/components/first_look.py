@@ -24,7 +24,6 @@ from torchrl_her_recipes.config.resolve import (
     auto_options,
     ends_open,
     resolve,
-    trains_at_once,
 )
 
 _AT_ONCE = 8
@@ -36,7 +35,8 @@ _FUTURE = 16  # number of later goals of the episode that each transition is tri
 _DIGITS = 1e-4  # two rewards with at most this relative difference count as equal
 _TOUCH = 0.1  # quantile of the hand's distances in steps that move the object; nearer hands touch it
 _NEAR = 0.5  # a touching hand is nearer to the object than this share of its distance in other steps
-_WIDTHS = (5.0, 2.0, 1.4)  # radii of the goals of stages before a task whose goals chance does not achieve
+_FAR = 10.0  # rewards begin to grow at this multiple of the distance at which goals are achieved
+_AWAY = 5.0  # a goal at more than this multiple is far away
 _PAIRS = 32  # number of pairs of goals to estimate the distance below which a goal is achieved
 _HALVINGS = 20
 
@@ -63,7 +63,8 @@ class Facts:
         own_stages: whether the task has a curriculum of its own.
         stages: stages that ``propose_stages`` returns; empty if it proposes none, or if rewards depend on
             more than goals.
-        widths: stages that ``propose_widths`` returns; empty also if an episode achieved its goal or failed.
+        shaping: distances that ``propose_shaping`` returns; None also if rewards depend on more than goals,
+            or if an episode achieved its goal or failed.
         ends: rule that ends an episode at its goal, and what the environment did at goals; None if the
             environment has such a rule for all goals.
     """
@@ -83,7 +84,7 @@ class Facts:
     goal_inside: list[int]
     own_stages: bool
     stages: list[dict[str, Any]]
-    widths: list[dict[str, Any]]
+    shaping: list[float] | None
     ends: GoalEnds | None
 
 
@@ -92,15 +93,15 @@ def resolved(recipe: Recipe) -> Recipe:
 
     If environments are stepped one by one, random actions are taken if stages may have to be found, or if
     it is unknown what ends an episode at its goal. Stages are looked for if ``algo`` is ``auto``, or if the
-    algorithm learns stages and neither the recipe nor the task has any. The recipe stores the result, so
+    algorithm learns stages and neither the recipe nor the task has any; with ``algo=auto``, rewards of a
+    gymnasium environment may be shaped. The recipe stores the result, so
     that a resumed run and other processes need not take random actions again.
     """
     auto = recipe.hindsight.algo == AUTO and recipe.demonstrations.episodes == 0
     needs_stages = auto or (recipe.hindsight.algorithm.curriculum and recipe.curriculum.stages is None)
     if not (auto_options(recipe) or ends_open(recipe.task) or needs_stages):
         return recipe
-    at_once = trains_at_once(recipe)
-    known = f"{recipe.task} {needs_stages} {auto} {at_once}"
+    known = f"{recipe.task} {needs_stages} {auto}"
     if (facts := _FACTS.get(known)) is None:
         with closing(_watched(TaskEnvs.of(recipe)).make(1, [0])) as env:
             task = goal_env(env)
@@ -110,8 +111,9 @@ def resolved(recipe: Recipe) -> Recipe:
         open_ends = ends is not None and ends.env_ends is None and ends_open(recipe.task)
         if (needs_stages or open_ends) and not facts.batched:
             look = look_at(recipe.replace(seed=0), seconds=None)
-            stages = _needed_stages(look, auto, at_once) if needs_stages else None
-            facts, ends = replace(facts, stages=stages), look.ends
+            stages = _needed_stages(look, auto) if needs_stages else None
+            shaping = look.shaping if auto and stages is None else None
+            facts, ends = replace(facts, stages=stages, shaping=shaping), look.ends
         if ends is not None and ends_open(recipe.task):
             facts = replace(facts, ends=ends.found() or "never")
             say_once(ends.line())
@@ -126,18 +128,15 @@ def _watched(envs: TaskEnvs) -> TaskEnvs:
     return replace(envs, task=replace(envs.task, options=options, failure="environment"))
 
 
-def _needed_stages(facts: Facts, auto: bool, at_once: bool) -> list[dict[str, Any]] | None:
+def _needed_stages(facts: Facts, auto: bool) -> list[dict[str, Any]] | None:
     """Returns stages for a task, the same for each seed; None if none are found or needed.
 
     A task in which episodes end in failures gets no stages: a failure says nothing about the goals of an
-    earlier stage. If ``algo`` is ``auto`` and chance often changes the achieved goal, only wider goals may be
-    needed, and only if all stages are learned at once.
+    earlier stage. If ``algo`` is ``auto`` and chance often changes the achieved goal, none are needed.
     """
-    if facts.fallen > 0:
+    if facts.fallen > 0 or (auto and facts.moved >= SELDOM):
         return None
-    if not auto or facts.moved < SELDOM:
-        return facts.stages or None
-    return (facts.widths or None) if at_once else None
+    return facts.stages or None
 
 
 def look_at(recipe: Recipe, *, steps: int = _STEPS, seconds: float | None = _SECONDS) -> Facts:
@@ -235,7 +234,7 @@ def _facts(
         goal_inside=_columns(observations, rows["desired_goal"].double()),
         own_stages=_has_stages(task),
         stages=[] if task.info_keys else propose_stages(rows, meets),
-        widths=[] if task.info_keys or any(achieved) or any(fallen) else propose_widths(rows, meets),
+        shaping=None if task.info_keys or any(achieved) or any(fallen) else propose_shaping(rows, meets),
         ends=getattr(task, "goal_ends", None),
     )
 
@@ -316,29 +315,23 @@ def propose_stages(rows: TensorDictBase, meets: Meets) -> list[dict[str, Any]]:
     return [{"name": "reach", **reach, "threshold": threshold}, {"name": "task", **task}]
 
 
-def propose_widths(rows: TensorDictBase, meets: Meets) -> list[dict[str, Any]]:
-    """Proposes stages with wider goals before a task whose goals are small and far away.
-
-    All stages have the same inputs. So an agent that learns them at once cannot tell them apart, and learns
-    the mean of their rewards: the nearer to the goal, the better. The achieved goal must be part of the
-    observation, and in nine of ten steps farther from the desired goal than the widest stage's threshold.
+def propose_shaping(rows: TensorDictBase, meets: Meets) -> list[float] | None:
+    """Proposes rewards for being near goals that are small and far away.
 
     Args:
         rows: transitions [n] of random actions.
         meets: returns whether achieved goals [..., g] are the desired goals [..., g], as [...] of bool.
 
     Returns:
-        Stages in the form of ``curriculum=FILE.yaml``; empty if the task does not need or allow them.
+        The option ``shaping`` of a gymnasium environment: the distance at which goals are achieved, and ten
+        times this distance. None if goals have no such distance, or if random actions come within five times
+        of it in more than one of ten steps.
     """
-    goal = rows["achieved_goal"].double()
-    place, radius = _columns(rows["observation"].double(), goal), _radius(rows, meets)
-    distance = float((goal - rows["desired_goal"].double()).norm(dim=-1).quantile(0.1))
-    if not place or radius is None or distance < _WIDTHS[0] * radius:
-        return []
-    task = {"observation": "observation", "achieved_goal": place, "desired_goal": "desired_goal"}
-    widths = [float(f"{times * radius:.2g}") for times in _WIDTHS]
-    wider = [{"name": f"within {w:g}", **task, "threshold": w, "terminates": False} for w in widths]
-    return [*wider, {"name": "task", **task}]
+    radius = _radius(rows, meets)
+    away = (rows["achieved_goal"] - rows["desired_goal"]).double().norm(dim=-1)
+    if radius is None or float(away.quantile(0.1)) < _AWAY * radius:
+        return None
+    return [float(f"{times * radius:.2g}") for times in (1.0, _FAR)]
 
 
 def _radius(rows: TensorDictBase, meets: Meets) -> float | None:

@@ -14,6 +14,7 @@ from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.config.without_effect import without_effect
 
 TERMINATION = "termination"  # option of a task: the rule that ends an episode at its goal
+SHAPING = "shaping"  # option of a task: distances between which rewards of missed goals grow
 _WARMUP = 1_000  # least number of environment steps before the first gradient step
 _EPISODES = 100  # episodes in an epoch if environments are stepped one by one
 # Options that algo=auto sets if it chooses a curriculum and goals have equal weights
@@ -28,8 +29,10 @@ class EnvFacts:
     Args:
         max_steps: largest number of steps in an episode.
         batched: whether all environments are stepped in one call, so that each additional one costs little.
-        stages: stages of a curriculum for a task in which random actions seldom change the achieved goal, or
-            never achieve the desired one; else None.
+        stages: stages of a curriculum for a task in which random actions seldom change the achieved goal;
+            else None.
+        shaping: value of ``task.options.shaping`` for a task in which random actions never come near the
+            desired goal; else None.
         ends: value of ``task.options.termination`` that fits the environment; None if the task has no such
             option.
     """
@@ -37,6 +40,7 @@ class EnvFacts:
     max_steps: int
     batched: bool = False
     stages: Any = None
+    shaping: list[float] | None = None
     ends: str | None = None
 
 
@@ -96,11 +100,6 @@ def ends_open(task: TaskConfig) -> bool:
     return TERMINATION in known and (task.options or {}).get(TERMINATION, AUTO) == AUTO
 
 
-def trains_at_once(recipe: Recipe) -> bool:
-    """Returns whether ``algo=auto`` trains all stages at once: weights compare goals of one stage only."""
-    return recipe.weights.name == "none"
-
-
 def resolve(recipe: Recipe, facts: EnvFacts) -> Recipe:
     """Returns a copy of a recipe with a value for each option that was ``auto``.
 
@@ -113,10 +112,14 @@ def resolve(recipe: Recipe, facts: EnvFacts) -> Recipe:
         recipe = recipe.replace(stages=facts.stages)
     if facts.ends is not None and ends_open(recipe.task):
         recipe = recipe.replace(**{f"task.options.{TERMINATION}": facts.ends})
+    takes = SHAPING in get_task_spec(recipe.task.name).options
+    if facts.shaping and takes and SHAPING not in (recipe.task.options or {}):
+        recipe = recipe.replace(**{f"task.options.{SHAPING}": facts.shaping})
     for group, name in auto_options(recipe):
         values = {f"{group}.{name}": _VALUES[name](recipe, facts)}
         if name == "algo" and facts.stages:
             values |= {"stages": facts.stages, "guided_share": 0.5, "guided_per": "step"}
-            values |= _AT_ONCE if trains_at_once(recipe) else {"stage_epochs": _STAGE_EPOCHS}
+            # Weights compare goals of one stage only.
+            values |= _AT_ONCE if recipe.weights.name == "none" else {"stage_epochs": _STAGE_EPOCHS}
         recipe = recipe.replace(**values)
     return recipe

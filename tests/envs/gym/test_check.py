@@ -69,7 +69,7 @@ def test_what_to_install_is_said(absent: str, said: str, monkeypatch: pytest.Mon
 
 
 def test_an_option_that_an_environment_does_not_take_is_named() -> None:
-    ours = "max_steps, parallel, termination, achieved_reward, info_keys, "
+    ours = "max_steps, parallel, termination, achieved_reward, info_keys, shaping, "
     ours += "observation_key, achieved_goal_key, desired_goal_key, pictures"
     allowed = f"{ours}, ends, form, without, actions, shown, render_mode"
     with pytest.raises(ValueError, match=f"^{WALK} takes no option 'color'; its options are {allowed}$"):

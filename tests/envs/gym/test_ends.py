@@ -230,3 +230,25 @@ def test_rewards_of_steps_that_goals_do_not_explain_are_noticed(said: pytest.Log
     plain(cost=0.25)
     pattern = "a step gave the reward -.*25, and compute_reward .* for the same"
     assert any(re.search(pattern, record.getMessage()) for record in said.records)
+
+
+@pytest.mark.parametrize("cost", [0.0, 0.25])
+def test_missed_goals_get_more_reward_the_nearer_they_are(cost: float) -> None:
+    """The goal is at place 9, the walk between 0 and 4; costs of steps stay as they are."""
+    env = plain(4, unseen=True, tells=False, cost=cost, shaping=[2.0, 8.0], achieved_reward=0.0)
+    after = steps(env)
+    away = 9 - after["achieved_goal"]
+    plainly = -1 - (away < 0).float()
+    expected = plainly + (torch.log(8 / away) / torch.log(torch.tensor(4.0))).clamp(0, 0.99)
+    torch.testing.assert_close(after["reward"], expected - cost)
+    torch.testing.assert_close(env.compute_reward(after["achieved_goal"], after["desired_goal"]), expected)
+    goals = torch.tensor([[3.0], [4.0]])
+    rewards = env.compute_reward(goals, torch.tensor([[3.0], [5.0]])).flatten().tolist()
+    assert rewards == pytest.approx([0.0, -0.01])  # the second one is missed, if narrowly
+    assert env.dense_reward
+
+
+@pytest.mark.parametrize("shaping", [[1.0], [2.0, 1.0], [0.0, 1.0], [1.0, 2.0, 3.0], 1.0])
+def test_distances_that_cannot_shape_rewards_are_refused(shaping: Any) -> None:
+    with pytest.raises(ValueError, match=r"shaping must be two distances, 0 < near < far, got"):
+        plain(shaping=shaping)

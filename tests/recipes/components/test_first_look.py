@@ -15,6 +15,7 @@ from gymnasium import spaces
 from torchrl_her_envs import make_env
 from torchrl_her_envs.common import goal_rules
 from torchrl_her_recipes import RunFolder, build, look_at, make_recipe, run
+from torchrl_her_recipes.cli import main
 from torchrl_her_recipes.components import first_look
 from torchrl_her_recipes.components.first_look import resolved
 from torchrl_her_recipes.config.imports import allow_imports
@@ -110,7 +111,8 @@ def test_what_ends_episodes_is_found_by_many_steps_and_said_once(
 ) -> None:
     for seed in (0, 1):
         recipe = resolved(make_recipe(task=TASK, seed=seed, **{"task.options": options}))
-        assert recipe.task.options == {**options, "termination": ends}
+        found = {"termination": ends, **({"shaping": [1.0, 10.0]} if options == {"near": 0.0} else {})}
+        assert recipe.task.options == {**options, **found}
     lines = [own.getMessage() for own in said.records if own.levelno == logging.INFO]
     assert len(lines) == (line is not None)
     assert line is None or line in lines[0]
@@ -160,21 +162,26 @@ def test_ends_without_goals_are_counted_in_whole_episodes(options: dict[str, Any
 
 
 @pytest.mark.parametrize(
-    ("task", "more", "widths"),
+    ("task", "more", "shaping"),
     [
-        ({"near": 0.0}, {}, [5.0, 2.0, 1.4]),
-        ({"near": 1.0}, {}, []),
-        ({"near": 0.0, "lasts": 4}, {}, []),
-        ({"near": 0.0}, {"weights": "rare"}, []),
+        ({"near": 0.0}, {}, [1.0, 10.0]),
+        ({"near": 0.0, "shaping": [1.0, 5.0]}, {}, [1.0, 5.0]),
+        ({"near": 0.0}, {"algo": "filtered_her"}, None),
+        ({"near": 1.0}, {}, None),
+        ({"near": 0.0, "lasts": 4}, {}, None),
     ],
-    ids=["far away", "within reach", "failures", "weights, so one stage at a time"],
+    ids=["far away", "given", "not asked for", "within reach", "failures"],
 )
-def test_small_goals_far_away_get_wider_ones_before(
-    task: dict[str, Any], more: dict[str, Any], widths: list[float]
+def test_small_goals_far_away_get_shaped_rewards(
+    task: dict[str, Any], more: dict[str, Any], shaping: list[float] | None
 ) -> None:
     recipe = resolved(make_recipe(task=TASK, **{"task.options": task}, **more))
-    *wider, last = recipe.curriculum.stages or [{}]
-    assert [stage["threshold"] for stage in wider] == pytest.approx(widths, rel=0.05)
-    assert not any(stage["terminates"] for stage in wider)
-    assert all(stage[key] == last[key] for stage in wider for key in last if key != "name")
-    assert recipe.hindsight.algo == ("cher" if widths else "filtered_her")
+    assert recipe.task.options is not None
+    assert recipe.task.options.get("shaping") == shaping
+    assert recipe.hindsight.algo == "filtered_her"
+
+
+def test_what_was_chosen_is_said(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    sizes = [f"{name}={value}" for name, value in SIZES.items()]
+    assert main(["train", f"task={TASK}", "task.options.near=0.0", *sizes, f"folder={tmp_path / 'run'}"]) == 0
+    assert "algo=auto chose task.options.shaping=[1.0, 10.0], since random actions" in capsys.readouterr().out

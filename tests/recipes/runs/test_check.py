@@ -193,8 +193,8 @@ def test_what_is_slow_or_easy_or_of_many_scales_is_told() -> None:
         "random actions achieve 80% of the goals",
     ]
     assert said(replace(facts, seconds=1e-4, achieved=0.1)) == ""
-    far = replace(facts, seconds=1e-4, achieved=0.0, widths=facts.stages)
-    assert "never come near a goal" in said(far, algo="filtered_her")
+    far = replace(facts, seconds=1e-4, achieved=0.0, shaping=[0.1, 1.0])
+    assert "near it help (task.options.shaping=[0.1,1.0])" in said(far)
 
 
 def test_on_the_command_line(
