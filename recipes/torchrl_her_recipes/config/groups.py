@@ -171,7 +171,7 @@ class HindsightConfig(Group):
     algo: str = option(
         AUTO,
         "an algorithm of `torchrl-her list`; auto: filtered_her, or cher if random actions seldom change the "
-        "achieved goal, if they never come near the desired one, or if curriculum=FILE is given",
+        "achieved goal, or if curriculum=FILE is given",
     )
     k: int = option(4, "number of virtual transitions for each real one", at_least=0)
     strategy: str = option(
