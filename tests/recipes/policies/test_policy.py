@@ -32,7 +32,7 @@ from ..small import Refused, small
 from .tiny import needs_onnx, states, tiny_policy
 
 _GYM = ("fetch_push", "fetch_pick_and_place", "shadow_hand_reach")
-_PANDA = ("panda_push", "panda_pick_and_place", "panda_stack")
+_PANDA = ("panda_push", "panda_pick_and_place", "panda_slide", "panda_stack")
 OTHERS = dict.fromkeys(_GYM, "") | dict.fromkeys(_PANDA, "panda_gym")  # and modules that they need
 
 
