@@ -208,7 +208,7 @@ def _problem(
     if func in _ON_THE_CPU_ONLY and there[0]:
         return "a tensor on the device"
     copied = func in (Tensor.to, Tensor.copy_) and after and not there[-1]
-    if copied and torch.cuda.is_current_stream_capturing():
+    if copied and torch.cuda.is_available() and torch.cuda.is_current_stream_capturing():
         return "a tensor on the CPU, while a graph is recorded"
     if func in _MOVES or func in _FACTORIES or all(there) or not any(there):
         return ""
