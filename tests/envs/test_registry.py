@@ -125,7 +125,7 @@ def test_options_reach_the_environment() -> None:
         (
             f"gym:{WALK}",
             "speed",
-            "max_steps, parallel, termination, achieved_reward, info_keys, "
+            "max_steps, parallel, termination, achieved_reward, info_keys, shaping, "
             "observation_key, achieved_goal_key, desired_goal_key, pictures, "
             "ends, form, without, actions, shown, render_mode",
         ),
