@@ -285,9 +285,11 @@ class GymGoalEnv(GoalEnv, GymWrapper):
             self._terminated_of = self._function(TERMINATED, goals, info)
             env_ends = bool(self._terminated_of.tried.any())
         self.goal_ends = GoalEnds(id, env_ends=env_ends, tells_success=trial.success is not None)
-        self._count_ends(trial)
-        if self.goal_ends.found() is None:
-            self._count_ends(try_steps(env, layout, at_goals=True))
+        self._count_ends(trial, met)
+        if termination in ("auto", "watch") and self.goal_ends.found() is None:
+            trial = try_steps(env, layout, at_goals=True)
+            computed = reward_of(trial.achieved, trial.desired, infos.stack(trial.infos))
+            self._count_ends(trial, computed >= self.achieved_reward)
         self.goal_ends.decide(termination)
         if trial.success is not None:
             shape = (*self.batch_size, 1)
@@ -295,11 +297,8 @@ class GymGoalEnv(GoalEnv, GymWrapper):
         if info:
             self.observation_spec[INFO] = infos.spec(self.batch_size[0])
 
-    def _count_ends(self, trial: Trial) -> None:
-        met = trial.success
-        if met is None:
-            rewards = self._reward_of(trial.achieved, trial.desired, self._infos.stack(trial.infos))
-            met = rewards >= self.achieved_reward
+    def _count_ends(self, trial: Trial, met: np.ndarray) -> None:
+        met = met if trial.success is None else trial.success
         self.goal_ends.apply(met, trial.terminated, trial.truncated)
 
     @property
@@ -474,7 +473,8 @@ class GymGoalEnv(GoalEnv, GymWrapper):
             shown = {**shown, SUCCESS: info[SUCCESS]}
         shown = {**shown, INFO: self._infos.of_batch(info, len(reward))}
         if isinstance(self._reward_of, ShapedReward):
-            reward = reward + self._reward_of.bonus(*self._goals(shown), shown[INFO])
+            goals = self._goals(shown)
+            reward = reward + self._reward_of.bonus(*goals, self._reward_of.function(*goals, shown[INFO]))
         if self.ends != "own":
             met = self._met(shown)
             terminated, truncated = self.goal_ends.apply(met, terminated, truncated)

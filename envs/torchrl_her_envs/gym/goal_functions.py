@@ -190,16 +190,16 @@ class ShapedReward:
     def __init__(self, function: Function, missed: float, achieved: float, shaping: Sequence[float]) -> None:
         if np.shape(shaping) != (2,) or not 0 < shaping[0] < shaping[1] < np.inf:
             raise ValueError(f"shaping must be two distances, 0 < near < far, got {shaping}")
-        self._function, self._achieved, self._gain = function, achieved, achieved - missed
+        self.function, self._achieved, self._gain = function, achieved, achieved - missed
         self._near, self._far = shaping
 
     def __call__(self, achieved: np.ndarray, desired: np.ndarray, info: Info = _NOTHING) -> np.ndarray:
         """Returns the rewards [B] of goals [B, g], with the entries [B, ...] of their infos."""
-        return self._function(achieved, desired, info) + self.bonus(achieved, desired, info)
+        reward = self.function(achieved, desired, info)
+        return reward + self.bonus(achieved, desired, reward)
 
-    def bonus(self, achieved: np.ndarray, desired: np.ndarray, info: Info = _NOTHING) -> np.ndarray:
-        """Returns what is added to the rewards [B] of goals [B, g]: 0 where they are achieved."""
-        missed = self._function(achieved, desired, info) < self._achieved
+    def bonus(self, achieved: np.ndarray, desired: np.ndarray, reward: np.ndarray) -> np.ndarray:
+        """Returns what is added to the sparse rewards [B] of goals [B, g]: 0 where they are achieved."""
         distance = np.linalg.norm(achieved - desired, axis=-1).clip(self._near, self._far)
         share = np.log(self._far / distance) / np.log(self._far / self._near)
-        return self._gain * np.where(missed, share.clip(0, _MOST), 0)
+        return self._gain * np.where(reward < self._achieved, share.clip(0, _MOST), 0)

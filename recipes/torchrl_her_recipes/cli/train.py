@@ -20,7 +20,7 @@ from torchrl_her_recipes.cli.train_options import (
 )
 from torchrl_her_recipes.config.imports import imported_modules, needs_permission
 from torchrl_her_recipes.config.recipe import Recipe, check_extending
-from torchrl_her_recipes.config.resolve import SHAPING, auto_options
+from torchrl_her_recipes.config.resolve import SHAPING, auto_options, left_open
 
 
 @click.command(cls=OptionsCommand, short_help="train, or resume a run")
@@ -84,7 +84,7 @@ def _train(recipe: Recipe, folder: Path) -> recipes.RunResult:
             "trains without a curriculum)"
         )
     near_far = (components.recipe.task.options or {}).get(SHAPING)
-    if near_far and near_far != (recipe.task.options or {}).get(SHAPING):
+    if near_far and left_open(recipe.task, SHAPING):
         click.echo(
             f"algo=auto chose task.options.shaping={near_far}, since random actions never come near a goal: "
             "missing it by less than the second distance has a higher reward, the nearer the higher "

@@ -18,13 +18,7 @@ from torchrl_her_envs.common.goal_rules import GoalEnds, say_once
 from torchrl_her_recipes.components.envs import TaskEnvs, action_bounds, judging, task_reward
 from torchrl_her_recipes.config.options import AUTO
 from torchrl_her_recipes.config.recipe import Recipe
-from torchrl_her_recipes.config.resolve import (
-    TERMINATION,
-    EnvFacts,
-    auto_options,
-    ends_open,
-    resolve,
-)
+from torchrl_her_recipes.config.resolve import TERMINATION, EnvFacts, auto_options, left_open, resolve
 
 _AT_ONCE = 8
 _STEPS = 3_000
@@ -93,13 +87,13 @@ def resolved(recipe: Recipe) -> Recipe:
 
     If environments are stepped one by one, random actions are taken if stages may have to be found, or if
     it is unknown what ends an episode at its goal. Stages are looked for if ``algo`` is ``auto``, or if the
-    algorithm learns stages and neither the recipe nor the task has any; with ``algo=auto``, rewards of a
-    gymnasium environment may be shaped. The recipe stores the result, so
-    that a resumed run and other processes need not take random actions again.
+    algorithm learns stages and neither the recipe nor the task has any. With ``algo=auto``, rewards of a
+    gymnasium environment may be shaped. The recipe stores the result, so that a resumed run and other
+    processes need not take random actions again.
     """
     auto = recipe.hindsight.algo == AUTO and recipe.demonstrations.episodes == 0
     needs_stages = auto or (recipe.hindsight.algorithm.curriculum and recipe.curriculum.stages is None)
-    if not (auto_options(recipe) or ends_open(recipe.task) or needs_stages):
+    if not (auto_options(recipe) or left_open(recipe.task, TERMINATION) or needs_stages):
         return recipe
     known = f"{recipe.task} {needs_stages} {auto}"
     if (facts := _FACTS.get(known)) is None:
@@ -108,13 +102,13 @@ def resolved(recipe: Recipe) -> Recipe:
             facts = EnvFacts(max_steps=task.max_steps, batched=task.batched)
             ends: GoalEnds | None = getattr(task, "goal_ends", None)
             needs_stages = needs_stages and (auto or not _has_stages(task))
-        open_ends = ends is not None and ends.env_ends is None and ends_open(recipe.task)
+        open_ends = ends is not None and ends.env_ends is None and left_open(recipe.task, TERMINATION)
         if (needs_stages or open_ends) and not facts.batched:
             look = look_at(recipe.replace(seed=0), seconds=None)
             stages = _needed_stages(look, auto) if needs_stages else None
             shaping = look.shaping if auto and stages is None else None
             facts, ends = replace(facts, stages=stages, shaping=shaping), look.ends
-        if ends is not None and ends_open(recipe.task):
+        if ends is not None and left_open(recipe.task, TERMINATION):
             facts = replace(facts, ends=ends.found() or "never")
             say_once(ends.line())
         _FACTS[known] = facts
@@ -123,7 +117,7 @@ def resolved(recipe: Recipe) -> Recipe:
 
 def _watched(envs: TaskEnvs) -> TaskEnvs:
     """Returns ``envs`` with the environment's rewards of failures and, for ``termination=auto``, its ends."""
-    ends = {TERMINATION: "watch"} if ends_open(envs.task) else {}
+    ends = {TERMINATION: "watch"} if left_open(envs.task, TERMINATION) else {}
     options = {**(envs.task.options or {}), **ends} or None
     return replace(envs, task=replace(envs.task, options=options, failure="environment"))
 

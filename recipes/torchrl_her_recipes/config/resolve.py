@@ -87,17 +87,17 @@ def auto_options(recipe: Recipe) -> list[tuple[str, str]]:
     return [pair for pair in names if getattr(getattr(recipe, pair[0]), pair[1]) == AUTO and pair not in idle]
 
 
-def ends_open(task: TaskConfig) -> bool:
-    """Returns whether the task's option ``termination`` exists and is left to the environment (``auto``).
+def left_open(task: TaskConfig, option: str) -> bool:
+    """Returns whether an option of the task exists and has its default, so that a value may be found for it.
 
     Example:
         >>> push = TaskConfig(name="gym:FetchPush-v4")
         >>> never = TaskConfig(name="gym:FetchPush-v4", options={"termination": "never"})
-        >>> ends_open(push), ends_open(never), ends_open(TaskConfig())
-        (True, False, False)
+        >>> [left_open(task, "termination") for task in (push, never, TaskConfig())]
+        [True, False, False]
     """
     known = get_task_spec(task.name).options
-    return TERMINATION in known and (task.options or {}).get(TERMINATION, AUTO) == AUTO
+    return option in known and (task.options or {}).get(option, known[option]) == known[option]
 
 
 def resolve(recipe: Recipe, facts: EnvFacts) -> Recipe:
@@ -110,16 +110,15 @@ def resolve(recipe: Recipe, facts: EnvFacts) -> Recipe:
     """
     if facts.stages and recipe.hindsight.algo != AUTO:
         recipe = recipe.replace(stages=facts.stages)
-    if facts.ends is not None and ends_open(recipe.task):
+    if facts.ends is not None and left_open(recipe.task, TERMINATION):
         recipe = recipe.replace(**{f"task.options.{TERMINATION}": facts.ends})
-    takes = SHAPING in get_task_spec(recipe.task.name).options
-    if facts.shaping and takes and SHAPING not in (recipe.task.options or {}):
+    if facts.shaping and left_open(recipe.task, SHAPING):
         recipe = recipe.replace(**{f"task.options.{SHAPING}": facts.shaping})
     for group, name in auto_options(recipe):
         values = {f"{group}.{name}": _VALUES[name](recipe, facts)}
         if name == "algo" and facts.stages:
             values |= {"stages": facts.stages, "guided_share": 0.5, "guided_per": "step"}
-            # Weights compare goals of one stage only.
+            # Weights compare the goals of one stage only, so weighted goals need one stage at a time.
             values |= _AT_ONCE if recipe.weights.name == "none" else {"stage_epochs": _STAGE_EPOCHS}
         recipe = recipe.replace(**values)
     return recipe

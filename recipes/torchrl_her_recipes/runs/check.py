@@ -7,7 +7,7 @@ from typing import Any
 from torchrl_her_recipes.components.first_look import SELDOM, Facts, resolved
 from torchrl_her_recipes.config.algorithms import Algorithm
 from torchrl_her_recipes.config.recipe import Recipe
-from torchrl_her_recipes.config.resolve import SHAPING
+from torchrl_her_recipes.config.resolve import SHAPING, left_open
 
 _UNLIKE = 100  # ratio of scales above which observations need normalization
 _SLOW = 5e-3  # seconds of a step above which an environment is slow; a gradient step takes about as long
@@ -43,7 +43,7 @@ def advice(facts: Facts, recipe: Recipe, stages_file: str = "stages.yaml") -> li
     if facts.moved < SELDOM:
         remedy = _remedy(facts, recipe.hindsight.algorithm, recipe.curriculum.stages, stages_file)
         lines.append(f"{_STILL.format(facts=facts, moved=_percent(facts.moved))} {remedy}")
-    elif facts.shaping and not (recipe.task.options or {}).get(SHAPING):
+    elif facts.shaping and left_open(recipe.task, SHAPING):
         lines.append(
             "random actions never come near a goal: higher rewards near it help "
             f"(task.options.{SHAPING}=[{','.join(map(str, facts.shaping))}])"
