@@ -58,12 +58,21 @@ def _epoch_frames(collection: CollectionConfig, run: RunConfig, facts: EnvFacts)
     return max(frames, collection.num_envs * collection.steps_per_batch)
 
 
+def _gamma(recipe: Recipe, facts: EnvFacts) -> float:
+    """Returns a discount with a horizon 1 / (1 - gamma) of half an episode, or of a tenth.
+
+    Shaped rewards pay at once for each step that brings a goal nearer.
+    """
+    shaped = (recipe.task.options or {}).get(SHAPING)
+    horizon, least = (facts.max_steps / 10, 0.8) if shaped else (facts.max_steps / 2, 0.9)
+    return round(min(max(1 - 1 / horizon, least), 0.99), 4)
+
+
 # Computed in this order: later values depend on earlier ones.
 _VALUES: dict[str, Callable[[Recipe, EnvFacts], Any]] = {
     "algo": lambda _recipe, facts: "cher" if facts.stages else "filtered_her",
     "goal_sources": lambda recipe, _facts: recipe.hindsight.sources,
-    # The horizon 1 / (1 - gamma) is half an episode.
-    "gamma": lambda _recipe, facts: round(min(max(1 - 2 / facts.max_steps, 0.9), 0.99), 4),
+    "gamma": _gamma,
     "num_envs": lambda recipe, facts: _num_envs(recipe.collection.processes, facts),
     "frames_per_update": lambda _recipe, facts: 5.0 if facts.batched else 1.0,
     "epoch_frames": lambda recipe, facts: _epoch_frames(recipe.collection, recipe.run, facts),

@@ -32,6 +32,15 @@ def test_values_follow_from_the_environment(max_steps: int, batched: bool, value
     assert auto_options(recipe) == []
 
 
+@pytest.mark.parametrize(("max_steps", "gamma"), [(20, 0.8), (50, 0.8), (100, 0.9), (2_000, 0.99)])
+def test_shaped_rewards_need_a_short_horizon_only(max_steps: int, gamma: float) -> None:
+    facts = EnvFacts(max_steps=max_steps, shaping=[0.01, 0.1])
+    given = make_recipe(task="gym:HandReach-v3", **{"task.options": {"shaping": [0.01, 0.1]}})
+    assert resolve(make_recipe(task="gym:HandReach-v3"), facts).learner.gamma == gamma
+    assert resolve(given, EnvFacts(max_steps=max_steps)).learner.gamma == gamma
+    assert resolve(given.replace(gamma=0.95), facts).learner.gamma == 0.95
+
+
 def test_a_curriculum_comes_with_its_options() -> None:
     stages = [{"name": "near"}, {"name": "all"}]
     recipe = resolve(make_recipe(), EnvFacts(max_steps=50, stages=stages))

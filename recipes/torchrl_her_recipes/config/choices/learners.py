@@ -53,7 +53,11 @@ class LearnerConfig(Choice):
 
     device: str = option("cpu", "device of the networks: cpu, cuda, cuda:1, ..., or auto")
     gamma: float = option(
-        AUTO, "discount factor; auto: 1 - 2 / (steps of an episode), within 0.9 to 0.99", above=0, below=1
+        AUTO,
+        "discount factor; auto: 1 - 2 / (steps of an episode), within 0.9 to 0.99; with shaped rewards "
+        "1 - 10 / (steps of an episode), within 0.8 to 0.99",
+        above=0,
+        below=1,
     )
     learning_rate: float = option(1e-3, "learning rate of Adam", above=0)
     max_grad_norm: float = option(
