@@ -23,6 +23,7 @@ _ENTRIES: list[NestedKey] = [
     "action",
     *(("next", name) for name in (*_SEEN, "reward", *_ENDS)),
 ]
+_PLAYED: list[NestedKey] = ["state", "stage", ("next", "state"), ("next", "stage")]
 _KIND = "demonstrations 1"
 
 
@@ -33,7 +34,8 @@ class Demonstrations:
     Args:
         rows: [n], all transitions: ``observation``, ``achieved_goal``, ``desired_goal``, ``action``, and
             under ``next`` the first three with ``reward``, ``terminated``, ``truncated`` and ``done``. The
-            last transition of each episode is done, and no other one. Other entries are left out.
+            last transition of each episode is done, and no other one. Other entries are left out, except
+            for ``state`` and ``stage`` of a curriculum.
         lengths: [E] int64, transitions of each episode.
 
     Keyword Args:
@@ -66,7 +68,7 @@ class Demonstrations:
         known = set(self.rows.keys(True, True))
         if missing := [key for key in _ENTRIES if key not in known]:
             raise ValueError(f"demonstrations need the entry {missing[0]!r}, got {sorted(known, key=str)}")
-        object.__setattr__(self, "rows", self.rows.select(*_ENTRIES))
+        object.__setattr__(self, "rows", self.rows.select(*_ENTRIES, *_PLAYED, strict=False))
         if self.lengths.ndim != 1 or len(self.lengths) == 0 or int(self.lengths.min()) < 1:
             raise ValueError(f"demonstrations need lengths [E] of at least 1, got {self.lengths.tolist()}")
         n = int(self.lengths.sum())

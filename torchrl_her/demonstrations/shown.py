@@ -60,6 +60,8 @@ def in_stage(
     curriculum: Curriculum,
     stage: int,
     task_reward: RewardFunction | None = None,
+    *,
+    by_episode: bool = False,
 ) -> Demonstrations:
     """Converts demonstrations of the full task to the view of a stage, like :class:`~torchrl_her.StateToObs`.
 
@@ -72,6 +74,10 @@ def in_stage(
         stage: index of the stage, from 0.
         task_reward: reward of the full task, for a last stage without a threshold; None keeps the recorded
             rewards.
+
+    Keyword Args:
+        by_episode: whether to add ``state`` and ``stage``, which a writer needs whose episodes each have a
+            stage of their own (:class:`~torchrl_her.replay_buffers.StageRule`).
 
     Raises:
         ValueError: observation and goal are not as wide as the curriculum's state.
@@ -87,6 +93,10 @@ def in_stage(
             )
         entries = curriculum.show(state, stage)
         tensordict.update(dict(zip(("observation", "achieved_goal", "desired_goal"), entries, strict=True)))
+        if by_episode:
+            tensordict.update(
+                {"state": state, "stage": torch.full_like(rows["next", "done"], stage, dtype=torch.int64)}
+            )
     if stage < len(curriculum) - 1:
         after["terminated"] = torch.zeros_like(after["terminated"])
     rows.set("next", after)

@@ -49,7 +49,7 @@ def build(recipe: Recipe) -> Components:
     # If other processes collect, this environment plays no episodes: only its specs are read.
     task = envs.make(1 if processes else collection.num_envs, seeds)
     progress = make_progress(recipe.order, envs.curriculum, task, seeds)
-    check_order(recipe.order, progress, recipe.weights, processes, recipe.demonstrations.episodes)
+    check_order(recipe.order, progress, recipe.weights, processes)
     tests, test_seeds = evaluation_envs(recipe.task.name, recipe.evaluation.episodes), eval_seeds(seeds, 0)
     state = make_curriculum_state(progress, envs, tests, test_seeds)
     space = goal_space(recipe.weights, envs, task, collection.num_envs)
@@ -85,7 +85,7 @@ def build(recipe: Recipe) -> Components:
         make_buffer, recipe, task, generators, space=space, state=state, norm=agent.norm, devices=devices
     )
     if demonstrations is not None and recipe.demonstrations.in_batches:
-        capacity = rows_needed(recipe.hindsight, demonstrations.recorded)
+        capacity = rows_needed(recipe.hindsight, demonstrations)
         demonstrations.fill(replay(capacity=capacity), len(seeds))
     virtual = recipe.evaluation.virtual_goals
     return Components(

@@ -108,15 +108,12 @@ def make_curriculum_state(
     return CurriculumState(progress, in_stages(envs.make(num_envs, seeds), progress) if by_run else None)
 
 
-def check_order(
-    order: Order, progress: CurriculumProgress | None, weights: Weights, processes: int, demonstrations: int
-) -> None:
+def check_order(order: Order, progress: CurriculumProgress | None, weights: Weights, processes: int) -> None:
     """Refuses options that cannot be used if each episode has a stage of its own.
 
     Raises:
-        ValueError: Weights of goals are chosen, which would count goals of different stages together; several
-            processes collect although each needs the results of all episodes; or there are demonstrations,
-            which can be relabeled only for the single stage of a run.
+        ValueError: weights of goals are chosen, which would count goals of different stages together, or
+            several processes collect although each needs the results of all episodes.
     """
     if not isinstance(progress, EpisodeStages):
         return
@@ -129,11 +126,6 @@ def check_order(
         raise ValueError(
             f"order={order.name} draws stages by the results of all episodes: it needs processes=0, "
             f"got processes={processes}"
-        )
-    if demonstrations > 0:
-        raise ValueError(
-            f"demonstrations cannot be used with order={order.name}: they are relabeled for "
-            "one stage of a run, but each episode has a stage of its own; choose order=threshold"
         )
 
 

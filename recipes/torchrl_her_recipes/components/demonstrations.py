@@ -47,7 +47,10 @@ class RunDemonstrations:
         rule = task_reward(self.env)
         if self.state is None:
             return with_reward(self.recorded, rule)
-        return in_stage(self.recorded, self.state.curriculum, self.state.progress.stages[run], rule)
+        progress = self.state.progress
+        return in_stage(
+            self.recorded, progress.curriculum, progress.stages[run], rule, by_episode=progress.by_episode
+        )
 
     def fill(self, buffer: TensorDictReplayBuffer, runs: int) -> None:
         """Writes the demonstrations for each run into an empty buffer, and keeps the buffer."""
@@ -115,6 +118,11 @@ def load_demonstrations(
     recorded = _scaled(every.first(options.episodes), env).to(getattr(torch, envs.dtype))
     demonstrations = RunDemonstrations(recorded, env, state)
     if options.as_starts:
+        if state is not None and state.progress.by_episode:
+            raise ValueError(
+                f"demonstrations.starts_share={options.starts_share} cannot be used where each episode has a "
+                "stage of its own: leave it out, or choose order=threshold"
+            )
         if not callable(getattr(goal_env(env), "start_at", None)):
             raise ValueError(
                 f"demonstrations.starts_share={options.starts_share} cannot be used with {task}, "
@@ -171,7 +179,9 @@ def make_cloning(options: DemonstrationsConfig) -> Cloning | None:
     return Cloning(weight=options.bc_weight, q_filter=options.q_filter)
 
 
-def rows_needed(hindsight: HindsightConfig, demonstrations: Demonstrations) -> int:
+def rows_needed(hindsight: HindsightConfig, demonstrations: RunDemonstrations) -> int:
     """Returns the largest number of rows that a run's demonstrations can fill, virtual rows included."""
     copies = sum(hindsight.sources.values()) * hindsight.refill if hindsight.algorithm.virtual else 0
-    return len(demonstrations.rows) * (1 + copies)
+    state = demonstrations.state
+    stages = len(state.curriculum) if state is not None and state.progress.by_episode else 1
+    return len(demonstrations.recorded.rows) * (1 + copies) * stages

@@ -98,6 +98,25 @@ def test_another_threshold_rewards_them_anew(file: str) -> None:
 # Curricula
 
 
+@pytest.mark.parametrize("every_stage", [False, True])
+def test_where_stages_are_learned_at_once_they_are_written_for_the_task_or_for_all(
+    file: str, every_stage: bool
+) -> None:
+    options = {"algo": "cher", "order": "all_at_once", "order.every_stage": every_stage, "k": 1}
+    components = build(small(**{**asked(file), **options}, normalize=True))
+    recorded = components.demonstrations.recorded
+    rows, curriculum = rows_of_run(components.demonstrations.buffer, 0), components.curriculum.curriculum
+    real, last = rows[~rows["virtual"].flatten()], len(curriculum) - 1
+    state = torch.cat((recorded.rows["observation"], recorded.rows["desired_goal"]), -1)
+    for stage in range(len(curriculum)):
+        written = real[(real["stage"] == stage).flatten()]
+        if every_stage or stage == last:
+            assert (written["observation"] == curriculum.show(state, stage)[0]).all()
+        else:
+            assert len(written) == 0
+    components.trainer().epoch()
+
+
 def test_a_run_that_changes_its_stage_sees_them_in_the_new_one(file: str) -> None:
     components = build(small(**asked(file, starts_share=0.5), algo="cher", num_runs=2, normalize=True))
     shown, state = components.demonstrations, components.curriculum
@@ -272,8 +291,8 @@ def test_a_few_demonstrations_teach_what_no_reward_has_taught_yet(tmp_path: Path
     ("options", "message"),
     [
         (
-            {"algo": "cher", "order": "all_at_once"},
-            "demonstrations cannot be used with order=all_at_once: .* choose order=threshold",
+            {"algo": "cher", "order": "all_at_once", "demonstrations.starts_share": 0.5},
+            "starts_share=0.5 cannot be used where each episode has a stage of its own: .* order=threshold",
         ),
         (
             {"behavior": "mega", "demonstrations.starts_share": 0.5},
