@@ -42,11 +42,9 @@ class Relay(nn.Module):
     def __init__(self, curriculum: Curriculum) -> None:
         super().__init__()
         self.curriculum = curriculum
-        # Columns of ``Curriculum.extend(state)``: of each stage's input, and of the goals below the last one,
-        # which ends the task and may have no threshold.
-        inputs = ([*stage.observation, *stage.desired_goal] for stage in curriculum.stages)
         tables = {
-            "_inputs": torch.tensor([curriculum.padded(each, curriculum.input_width) for each in inputs]),
+            "_inputs": curriculum.input_columns,
+            # of the goals below the last one, which ends the task and may have no threshold
             "_goals": curriculum.state_index[:-1, curriculum.observation_width :],
             "_squares": torch.tensor([(stage.threshold or 0.0) ** 2 for stage in curriculum.stages[:-1]]),
             "_after": torch.arange(1, len(curriculum)),

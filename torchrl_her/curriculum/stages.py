@@ -144,6 +144,7 @@ class Curriculum:
             desired goal in the extended state.
         input_index: [stages, input_width], indices of the network's input in the observation with the
             desired goal and a zero appended.
+        input_columns: [stages, input_width], the same as columns of ``extend(state)``.
 
     Raises:
         ValueError: there is no stage, a name is unknown, an index lies outside of the state, the observation
@@ -198,6 +199,8 @@ class Curriculum:
         self.first_inputs = len(self.stages[0].observation) + len(self.stages[0].desired_goal)
         self.state_index = torch.tensor([self._state_index(stage) for stage in self.stages])
         self.input_index = torch.tensor([self._input_index(stage) for stage in self.stages])
+        inputs = ([*stage.observation, *stage.desired_goal] for stage in self.stages)
+        self.input_columns = torch.tensor([self.padded(each, self.input_width) for each in inputs])
 
     def __len__(self) -> int:
         return len(self.stages)

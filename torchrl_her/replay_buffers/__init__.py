@@ -12,9 +12,11 @@ from torchrl_her.replay_buffers.runs.sampler import RunsPrioritizedSampler, Runs
 from torchrl_her.replay_buffers.runs.storage import PackedStorage
 from torchrl_her.replay_buffers.sample_unit import HERSampleUnit
 from torchrl_her.replay_buffers.stage_rules import StageRule
+from torchrl_her.replay_buffers.symmetry import AugmentBatch, Shift, Symmetry
 from torchrl_her.replay_buffers.writer import HERWriter
 
 __all__ = [
+    "AugmentBatch",
     "EnvIds",
     "EpisodeIndex",
     "Episodes",
@@ -25,7 +27,9 @@ __all__ = [
     "PackedStorage",
     "RunsPrioritizedSampler",
     "RunsSampler",
+    "Shift",
     "StageRule",
+    "Symmetry",
     "TransitionKeys",
     "WriterCounts",
     "draw_goals",

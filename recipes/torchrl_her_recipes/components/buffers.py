@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
 import torch
+from tensordict import TensorDictBase
+from torch import Tensor
 from torchrl.data import PrioritizedSampler, TensorDictReplayBuffer
 from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.data.replay_buffers.scheduler import LinearScheduler
@@ -24,6 +26,7 @@ from torchrl_her.modules.normalized import NormalizeBatch
 from torchrl_her.replay_buffers import PackedStorage, RunsPrioritizedSampler, RunsSampler
 from torchrl_her.replay_buffers.keys import in_root_and_next
 from torchrl_her.replay_buffers.stage_rules import StageRule
+from torchrl_her.replay_buffers.symmetry import AugmentBatch, Shift, Symmetry
 from torchrl_her.replay_buffers.writer import HERWriter
 from torchrl_her_envs.common.goal_env import goal_env, reward_range
 from torchrl_her_recipes.components.curricula import CurriculumState
@@ -104,6 +107,8 @@ def make_buffer(
             for run in range(runs):
                 set_stage_goals(buffer.writer, state.progress.stage_of(run), run=run)
         buffer.append_transform(ZeroPad(state.curriculum, state.progress))
+    if recipe.replay.symmetry is not None:
+        buffer.append_transform(_make_augmentation(recipe.replay.symmetry, task, state, generators))
     if norm is not None:
         buffer.append_transform(NormalizeBatch(norm))
     return buffer
@@ -146,6 +151,46 @@ def _goals(options: HindsightConfig) -> dict[str, Any]:
     if options.goal_sources is not None:
         return {"goal_sources": options.goal_sources}
     return {"k": options.k, "strategy": options.strategy}
+
+
+def _make_augmentation(
+    options: Mapping[str, Any],
+    task: EnvBase,
+    state: CurriculumState | None,
+    generators: Sequence[torch.Generator],
+) -> AugmentBatch:
+    """Makes the transform that mirrors and shifts sampled transitions: the networks' inputs, and the actions.
+
+    Raises:
+        ValueError: an option of the symmetry is missing, unknown or out of its range.
+    """
+    try:
+        shifts = [Shift(**shift) for shift in options.get("shifts", ())]
+        symmetry = Symmetry(**{**options, "shifts": shifts})
+    except TypeError as error:
+        raise ValueError(f"{dict(options)!r} is no symmetry: {error}") from error
+    width, goal = (task.observation_spec[key].shape[-1] for key in ("observation", "desired_goal"))
+    if symmetry.mirror_action and not task.action_spec.dtype.is_floating_point:
+        raise ValueError("mirror_action of a symmetry needs continuous actions")
+    columns: dict[Any, Any] = {"observation": range(width), "desired_goal": range(width, width + goal)}
+    if state is not None:
+        columns = {"input": state.curriculum.input_columns}
+    return AugmentBatch(
+        symmetry,
+        columns,
+        width + goal,
+        actions=task.action_spec.shape[-1],
+        stage=None if state is None else partial(_stages, state, len(generators)),
+        generators=generators,
+    )
+
+
+def _stages(state: CurriculumState, runs: int, rows: TensorDictBase) -> Tensor:
+    """Returns the stage of each sampled transition, [n] int64."""
+    if state.progress.by_episode:
+        return rows.get("stage").squeeze(-1)
+    stages = torch.tensor(state.progress.stages, device=rows.get("action").device)
+    return stages.repeat_interleave(rows.numel() // runs)
 
 
 def rising_beta(sampler: Sampler, end: float | None, epochs: int) -> list[LinearScheduler]:

@@ -154,9 +154,16 @@ class ReplayConfig(Group):
     )
     batch_size: int = option(256, "number of transitions in a gradient step", at_least=1)
     batches_per_sample: int = option(32, "number of batches that one call of the sampler draws", at_least=1)
+    symmetry: Any = option(
+        None, "YAML file, or mapping, of mirror images and shifts of the task, drawn anew in each batch"
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if isinstance(self.symmetry, str):  # read at once: a saved recipe must not need the file
+            object.__setattr__(self, "symmetry", _read(Path(self.symmetry), "symmetry must be a YAML file"))
+        if self.symmetry is not None and not isinstance(self.symmetry, Mapping):
+            raise ValueError(f"symmetry must be a mapping, got {self.symmetry!r}")
         if self.batch_size > self.buffer_size:
             raise ValueError(f"batch_size={self.batch_size} must be at most buffer_size={self.buffer_size}")
 
@@ -249,7 +256,8 @@ class CurriculumConfig(Group):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.name != "task" and self.stages is None:  # read at once: a saved recipe must not need the file
-            object.__setattr__(self, "stages", _read_stages(Path(self.name)))
+            must = "curriculum must be 'task' or a YAML file with a list of stages"
+            object.__setattr__(self, "stages", _read(Path(self.name), must))
         stages = self.stages
         if stages is not None and not (
             isinstance(stages, list | tuple)
@@ -261,9 +269,9 @@ class CurriculumConfig(Group):
             )
 
 
-def _read_stages(path: Path) -> Any:
+def _read(path: Path, must: str) -> Any:
     if not path.is_file():
-        raise ValueError(f"curriculum must be 'task' or a YAML file with a list of stages, got {str(path)!r}")
+        raise ValueError(f"{must}, got {str(path)!r}")
     return read_yaml(path)
 
 

@@ -63,6 +63,44 @@ def test_goals_are_drawn_from_where_the_recipe_says() -> None:
         assert build(small(**values)).buffer.writer.options.sources == expected
 
 
+@pytest.mark.parametrize("order", [None, "threshold", "all_at_once"])
+def test_sampled_transitions_are_shifted_in_the_stage_of_each(order: str | None) -> None:
+    """The first column of the state, and the goal behind the observation, are moved far away together."""
+    stages = {"algo": "her"} if order is None else {"algo": "cher", "order": order, "num_runs": 2}
+    goal = build(small(task="hand_v1")).env.observation_spec["observation"].shape[-1]
+    symmetry = {"shifts": [{"columns": [0, goal], "most": 1e6}]}
+    components = build(small(task="hand_v1", **stages, symmetry=symmetry, normalize=False))
+    components.trainer().epoch()
+    curriculum = components.curriculum and components.curriculum.curriculum
+    rows = components.buffer.sample(64)
+    stored = components.buffer.storage[rows["index"].flatten()]
+    assert float(stored["observation"].abs().max()) < 1e3
+    for part in (rows, rows["next"]):
+        inputs = part["input"] if curriculum else torch.cat((part["observation"], part["desired_goal"]), -1)
+        assert float(inputs[:, 0].abs().max()) > 1e5
+        if order == "all_at_once":
+            moved = curriculum.input_columns[rows["stage"].squeeze(-1)]
+            goals = inputs[moved == goal]
+            assert len(goals) > 0
+            assert ((inputs - inputs[:, :1])[moved == goal].abs() < 1e3).all()
+            assert (inputs[(moved != goal) & (moved != 0)].abs() < 1e3).all()
+
+
+@pytest.mark.parametrize(
+    ("symmetry", "message"),
+    [
+        ("nowhere.yaml", "symmetry must be a YAML file, got 'nowhere.yaml'"),
+        ([1], r"symmetry must be a mapping, got \[1\]"),
+        ({"mirrors": {0: 0.0}}, "is no symmetry: .*unexpected keyword argument 'mirrors'"),
+        ({"shifts": [{"columns": [0]}]}, "is no symmetry: .*missing .* 'most'"),
+        ({"mirror": {99: 0.0}}, "the state has the columns 0 to .*, but the symmetry has 99"),
+    ],
+)
+def test_symmetries_that_cannot_be(symmetry: object, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        build(small(symmetry=symmetry))
+
+
 def test_refused_goals_are_left_out_if_the_recipe_says_so() -> None:
     assert build(small()).buffer.writer.options.redraw
     assert not build(small(redraw=False)).buffer.writer.options.redraw
