@@ -49,7 +49,7 @@ def conf() -> ModuleType:
         ("loggers.md", 2),
         ("normalization.md", 2),
         ("novelty.md", 4),
-        ("replay_buffers.md", 5),
+        ("replay_buffers.md", 6),
         ("weights.md", 3),
     ],
 )
