@@ -9,6 +9,7 @@ from torchrl_her.behavior.factors import (
     ValueCutoff,
 )
 from torchrl_her.behavior.memory import AchievedGoals
+from torchrl_her.behavior.proposal import GoalProposal
 from torchrl_her.behavior.transform import BehaviorGoals
 from torchrl_her.behavior.values import GoalValues
 
@@ -18,6 +19,7 @@ __all__ = [
     "DiscoverScore",
     "GoalCandidates",
     "GoalFactor",
+    "GoalProposal",
     "GoalValues",
     "InverseDensity",
     "Successes",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Literal, get_args
+from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -11,40 +11,25 @@ from torch import Tensor
 from torchrl.data import Binary, Composite
 from torchrl.envs import Transform
 
-from torchrl_her.behavior.factors import GoalCandidates, GoalFactor
+from torchrl_her.behavior.factors import GoalCandidates
 from torchrl_her.behavior.memory import AchievedGoals
-from torchrl_her.checks import check_whole, entry_of
+from torchrl_her.behavior.proposal import GoalProposal
+from torchrl_her.checks import entry_of
 from torchrl_her.env_keys import PROPOSED, PROPOSED_REACHED, EnvKeys
-from torchrl_her.goals.factors import draw
-from torchrl_her.goals.instructive import InstructiveWeights
 from torchrl_her.goals.rewards import RewardFunction, call_reward, outcomes
-from torchrl_her.goals.weights import GoalWeights, WeightsOfRuns, checked_weights, weights_by_run
+from torchrl_her.goals.weights import weights_by_run
 from torchrl_her.modules.noise import generator_states, set_generator_states
-from torchrl_her.randomness import Generators, RunDraws, check_generators, uniform
-
-UpdateOn = Literal["achieved", "proposed"]
+from torchrl_her.randomness import Generators, check_generators, uniform
 
 
 class BehaviorGoals(Transform):
     """Replaces the task's own goal by one that was achieved before, in a fraction of the episodes.
 
-    At a reset, some goals that the run has achieved are drawn, and one of them is proposed, in proportion to
-
-        weight(g) * factor(g) * factor(g) * ...
-
-    where ``weight`` is how useful a goal is, as for virtual goals. The factors measure how well the goal can
-    be achieved from the episode's start, and how well it leads to the task's goal. The episode's reward,
-    terminated and done are then computed for the proposed goal. All other episodes keep the task's own goal.
+    At a reset, some goals that the run has achieved are drawn, and ``proposal`` chooses one of them. The
+    episode's reward, terminated and done are then computed for it. All other episodes keep the task's goal.
     Two flags [..., 1] are written: ``proposed``, where the goal is a proposed one, and ``proposed_reached``,
     where a proposed goal was achieved in the episode.
     Leave this transform out of environments for evaluation.
-
-    | method | weights | update_on | factors | greedy |
-    | --- | --- | --- | --- | --- |
-    | uniform | none | | none | False |
-    | IBS | :class:`~torchrl_her.Instructiveness` | proposed | none | False |
-    | MEGA | none | | ``InverseDensity``, ``ValueCutoff`` | True |
-    | DISCOVER | none | | ``DiscoverScore``; with a single critic ``InverseDensity``, too | True |
 
     In a curriculum, put it after :class:`~torchrl_her.StateToObs` and before :class:`~torchrl_her.ZeroPad`.
     If episodes have stages, ``stage_key`` restricts it to those in ``stage``; if runs have stages, switch it
@@ -60,13 +45,9 @@ class BehaviorGoals(Transform):
         reward_fn: maps (achieved, desired) goals to (reward, terminated), as the environment's own does.
 
     Keyword Args:
-        weights: weights of goals; for several runs a list, one for each run. None for equal weights.
-        factors: the factors by which the weights are multiplied.
-        update_on: goals that the weights are updated on: ``achieved`` or ``proposed`` ones.
+        proposal: how goals are chosen; None for any achieved goal, with equal probability.
         remember: whether the transform remembers achieved goals; if not, add goals by ``memory.add``.
-        greedy: whether to propose the goal with the greatest product; if not, a goal is drawn in proportion.
         real_share: share of the episodes in which the task's own goal stays.
-        candidates: number of achieved goals drawn for each episode, of which one is proposed.
         memory: number of goals that each run remembers.
         runs: R, the number of independent runs.
         generators: generators, one for each run; None for torch's own, with one run only.
@@ -74,7 +55,6 @@ class BehaviorGoals(Transform):
         continues_after_termination: whether the environment can be stepped further after it terminated an
             episode; if not, the episode is truncated there.
         keys: keys of the entries that are read. All are also written, except observation and achieved goal.
-        real_goal_key: key under which the task's own goal is written.
         stage_key: key of the stage [..., 1] that an episode is played in, if episodes have stages.
         stage: index of the stage in which goals are proposed.
 
@@ -106,37 +86,28 @@ class BehaviorGoals(Transform):
         self,
         reward_fn: RewardFunction,
         *,
-        weights: GoalWeights | Sequence[GoalWeights] | None = None,
-        factors: Sequence[GoalFactor] = (),
-        update_on: UpdateOn = "achieved",
+        proposal: GoalProposal | None = None,
         remember: bool = True,
-        greedy: bool = False,
         real_share: float = 0.5,
-        candidates: int = 100,
         memory: int = 50_000,
         runs: int = 1,
         generators: Sequence[torch.Generator] | None = None,
         achieved_reward: float = 0.0,
         continues_after_termination: bool = False,
         keys: EnvKeys = EnvKeys(),
-        real_goal_key: NestedKey = "real_desired_goal",
         stage_key: NestedKey | None = None,
         stage: int = 0,
     ) -> None:
         if not 0.0 <= real_share <= 1.0:
             raise ValueError(f"real_share must be in [0, 1], got {real_share}")
-        check_whole(candidates=candidates)
-        if update_on not in get_args(UpdateOn):
-            raise ValueError(f"update_on must be one of {', '.join(get_args(UpdateOn))}, got {update_on!r}")
-        run_weights = weights_by_run(weights, runs)
+        self.proposal = proposal or GoalProposal()
+        weights_by_run(self.proposal.weights, runs)
         keys.check_ends(continues_after_termination=continues_after_termination)
         in_keys = [keys.observation, keys.achieved_goal, keys.desired_goal]
-        out_keys = [keys.desired_goal, real_goal_key, PROPOSED, PROPOSED_REACHED]
+        out_keys = [keys.desired_goal, "real_desired_goal", PROPOSED, PROPOSED_REACHED]
         super().__init__(in_keys=in_keys, out_keys=out_keys)
         self.generators: Generators = check_generators(runs, generators) or [None]
-        self.reward_fn, self.weights, self.factors = reward_fn, run_weights, list(factors)
-        self.remember, self.update_on, self.greedy = remember, update_on, greedy
-        self.real_share, self.candidates = real_share, candidates
+        self.reward_fn, self.remember, self.real_share = reward_fn, remember, real_share
         self.runs, self.achieved_reward = runs, achieved_reward
         self.continues_after_termination = continues_after_termination
         self.memory = AchievedGoals(memory, runs=runs)
@@ -147,10 +118,8 @@ class BehaviorGoals(Transform):
 
     def set_active(self, active: bool, *, run: int = 0) -> None:
         """Switches memory and proposals of a run on or off; its weights start anew when switched on."""
-        if active and not self._active[run] and self.weights:
-            self.weights[run].clear()
-            if isinstance(weights := self.weights[run], InstructiveWeights):
-                weights.restart()
+        if active and not self._active[run]:
+            self.proposal.restart(run)
         self._active[run] = active
 
     def success(self) -> Tensor:
@@ -163,8 +132,7 @@ class BehaviorGoals(Transform):
         """Returns the transform's whole state as tensors and plain data; it is a part of ``state_dict()``."""
         return {
             "memory": self.memory.state_dict(),
-            "weights": [weights.state_dict() for weights in self.weights],
-            "factors": [factor.state_dict() for factor in self.factors],
+            **self.proposal.state_dict(),
             "generators": generator_states(self.generators),
             "ended": self.ended,
             "achieved": self.achieved,
@@ -178,13 +146,7 @@ class BehaviorGoals(Transform):
             ValueError: the state is of another number of runs, or of other weights and factors.
         """
         self.memory.load_state_dict(state["memory"])
-        parts: dict[str, Sequence[GoalWeights | GoalFactor]]
-        parts = {"weights": self.weights, "factors": self.factors}
-        for name, each in parts.items():
-            if len(each) != len(state[name]):
-                raise ValueError(f"the state must have {len(each)} {name}, got {len(state[name])}")
-            for part, was in zip(each, state[name], strict=True):
-                part.load_state_dict(was)
+        self.proposal.load_state_dict(state)
         set_generator_states(self.generators, state["generators"])
         self.ended, self.achieved = state["ended"].clone(), state["achieved"].clone()
         self._active = list(state["active"])
@@ -281,9 +243,8 @@ class BehaviorGoals(Transform):
         if part is not None and not bool(part.any()):
             return
         self.memory.add(achieved, _rows(self._get(after, self.in_keys[0])), which=part)
-        if self.weights and self.update_on == "achieved":
-            goals = achieved if part is None else achieved[part]
-            self._weights_of_runs().update(goals, range(self.runs), self._counts(part, len(achieved)))
+        goals = achieved if part is None else achieved[part]
+        self.proposal.update("achieved", goals, self._counts(part, len(achieved)))
 
     def _propose(self, tensordict: TensorDictBase, begins: Tensor) -> tuple[Tensor, Tensor | None]:
         """Returns which of the environments [N] get a proposed goal, and these goals [m, g]."""
@@ -297,7 +258,7 @@ class BehaviorGoals(Transform):
         if not bool(chosen.any()):
             return torch.zeros_like(begins), None
         counts = self._counts(chosen, len(begins))
-        index = self.memory.draw(counts, self.candidates, self.generators)
+        index = self.memory.draw(counts, self.proposal.candidates, self.generators)
         candidates = GoalCandidates(
             goals=self.memory.goals(index),
             reached=self.memory.observations(index),
@@ -306,41 +267,20 @@ class BehaviorGoals(Transform):
             counts=counts,
             known=self._sample(counts),
         )
-        likelihood = self._likelihood(candidates)
-        if self.greedy:
-            place, valid = likelihood.argmax(1, keepdim=True), likelihood.amax(1) > 0
-        else:
-            place, valid = draw(
-                likelihood,
-                1,
-                generator=RunDraws(self.generators, candidates.run),
-            )
-        goals = candidates.goals.take_along_dim(place.unsqueeze(-1), 1).squeeze(1)
+        goals, valid = self.proposal.choose(candidates, self.generators)
         if not bool(valid.all()):  # environments without a valid goal keep the task's
             chosen, goals = chosen.index_put((chosen.clone(),), valid), goals[valid]
             counts = self._counts(chosen, len(begins))
-        if self.weights and self.update_on == "proposed":
-            self._weights_of_runs().update(goals, range(self.runs), counts)
+        self.proposal.update("proposed", goals, counts)
         return chosen, goals
 
     def _sample(self, counts: Sequence[int]) -> Sequence[Tensor]:
         """Draws a sample of achieved goals for each run with new episodes, as large as the factors need."""
-        number = max((factor.samples for factor in self.factors), default=0)
-        draws = [min(1, count) for count in counts]
+        draws, number = [min(1, count) for count in counts], self.proposal.samples
         if number == 0:
             return ()
         goals = self.memory.goals(self.memory.draw(draws, number, self.generators))
         return [part.flatten(0, 1) for part in goals.split(draws)]
-
-    def _likelihood(self, candidates: GoalCandidates) -> Tensor:
-        """Returns the likelihood [m, c] that each goal is proposed."""
-        likelihood = candidates.goals.new_ones(candidates.goals.shape[:-1])
-        if self.weights and not self.weights[0].is_uniform:
-            weights = self._weights_of_runs()(candidates.goals, range(self.runs), candidates.counts)
-            likelihood = checked_weights(weights, candidates.goals)
-        for factor in self.factors:
-            likelihood = likelihood * factor(candidates)
-        return likelihood
 
     def _count(self, ended: Tensor, achieved: Tensor) -> None:
         """Counts the episodes with proposed goals that have ended, and those that achieved their goal."""
@@ -351,11 +291,8 @@ class BehaviorGoals(Transform):
             total.to(count.device) + count
             for total, count in zip((self.ended, self.achieved), counts, strict=True)
         )
-        for factor in self.factors:
+        for factor in self.proposal.factors:
             factor.record(*counts)
-
-    def _weights_of_runs(self) -> WeightsOfRuns:
-        return type(self.weights[0]).of_runs(self.weights)
 
     def _counts(self, which: Tensor | None, rows: int) -> list[int]:
         """Returns the number of the given environments that belong to each run."""

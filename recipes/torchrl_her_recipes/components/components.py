@@ -150,7 +150,7 @@ class Components(Agent):
     def trainer(self) -> Trainer:
         """Returns the training loop over these components."""
         recipe, replay, demonstrations = self.recipe, self.recipe.replay, self.demonstrations
-        proposals = [] if self.behavior is None else self.behavior.weights
+        proposals = [] if self.behavior is None else self.behavior.proposal.weights
         weights = [*self.buffer.writer.goal_weights, *proposals]
         return Trainer(
             collector=self.collector,

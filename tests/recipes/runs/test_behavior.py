@@ -95,14 +95,14 @@ def test_goals_are_proposed_and_counted(way: str, whole: Whole) -> None:
 )
 def test_each_way_has_its_factors(way: str, factors: list[type[GoalFactor]]) -> None:
     behavior = build(recipe(way)).behavior
-    assert [type(own) for own in behavior.factors] == factors
-    assert behavior.greedy == bool(factors)
-    assert [type(own).__name__ for own in behavior.weights] == ["Instructiveness"] * (way == "ibs")
+    assert [type(own) for own in behavior.proposal.factors] == factors
+    assert behavior.proposal.greedy == bool(factors)
+    assert [type(own).__name__ for own in behavior.proposal.weights] == ["Instructiveness"] * (way == "ibs")
 
 
 def test_a_single_critic_leaves_it_to_rare_goals_what_is_new() -> None:
     behavior = build(recipe("discover", learner="ddpg")).behavior
-    assert [type(own) for own in behavior.factors] == [
+    assert [type(own) for own in behavior.proposal.factors] == [
         InverseDensity,
         DiscoverScore,
     ]  # TD3 above has two critics
@@ -128,7 +128,7 @@ def test_in_a_curriculum_goals_are_proposed_in_the_last_stage() -> None:
 
 def test_ibs_proposals_begin_with_the_last_stage() -> None:
     components = build(small(task="hand_v1", algo="cher", behavior="ibs"))
-    (weights,) = components.behavior.weights
+    (weights,) = components.behavior.proposal.weights
     assert isinstance(weights, Instructiveness)
     first = weights.sigma
     components.trainer().epoch()
@@ -199,7 +199,7 @@ def test_a_teacher_is_told_of_the_stages_own_goals(monkeypatch: pytest.MonkeyPat
 
 def test_the_cutoff_is_in_the_unit_of_the_tasks_values() -> None:
     behavior = build(recipe("mega", gamma=0.98)).behavior
-    achievable = behavior.factors[1]
+    achievable = behavior.proposal.factors[1]
     assert isinstance(achievable, ValueCutoff)
     assert (achievable.first, achievable.floor, achievable.step) == pytest.approx((-3.0, -50.0, 1.0))
     assert scaled_cutoffs(-3.0, 0.98, (0.0, 1.0)) == pytest.approx(
@@ -241,7 +241,7 @@ def test_options_that_cannot_be(options: dict[str, Any], message: str) -> None:
 def test_the_options_of_ibs_arrive_at_proposals_alone() -> None:
     options = {"sigma": 0.1, "behavior.cells": 8, "behavior.recent": 77, "floor": 0.01}
     components = build(recipe("ibs", **options))
-    (weights,) = components.behavior.weights
+    (weights,) = components.behavior.proposal.weights
     assert isinstance(weights, Instructiveness)
     assert weights.final_sigma == pytest.approx(0.1 * 2.0)  # the screen is 2 wide
     assert (weights.grid.shape, weights.recent, weights.floor) == ((8, 8), 77, 0.01)

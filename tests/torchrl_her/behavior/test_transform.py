@@ -14,7 +14,14 @@ from torchrl.envs import EnvBase, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_her import EnvKeys, GoalReward, GoalWeights, HERSampleUnit, HERWriter
-from torchrl_her.behavior import BehaviorGoals, DiscoverScore, GoalCandidates, GoalFactor, ValueCutoff
+from torchrl_her.behavior import (
+    BehaviorGoals,
+    DiscoverScore,
+    GoalCandidates,
+    GoalFactor,
+    GoalProposal,
+    ValueCutoff,
+)
 from torchrl_her.goals import RareGoals, RewardFunction
 from torchrl_her.trainers import collector_state_dict, load_collector_state_dict
 
@@ -54,7 +61,9 @@ class Farther(GoalFactor):
 def made(base: int | EnvBase = 2, *, runs: int = 1, reward: RewardFunction = REWARD, **options: object):
     """An environment, by default a line of so many, with behavior goals; and these."""
     generators = [torch.Generator().manual_seed(seed) for seed in range(runs)]
-    options = {"real_share": 0.0, "memory": 100} | options
+    chooses = ("weights", "update_on", "factors", "greedy", "candidates")
+    proposal = GoalProposal(**{name: options.pop(name) for name in chooses if name in options})  # type: ignore[arg-type]
+    options = {"real_share": 0.0, "memory": 100, "proposal": proposal} | options
     behavior = BehaviorGoals(reward, runs=runs, generators=generators, **options)  # type: ignore[arg-type]
     return TransformedEnv(Line(base) if isinstance(base, int) else base, behavior), behavior
 
@@ -338,11 +347,13 @@ def test_bad_options() -> None:
     with pytest.raises(ValueError, match=r"real_share must be in \[0, 1\], got 2"):
         BehaviorGoals(REWARD, real_share=2)
     with pytest.raises(ValueError, match="candidates must be at least 1, got 0"):
-        BehaviorGoals(REWARD, candidates=0)
+        GoalProposal(candidates=0)
     with pytest.raises(ValueError, match="update_on must be one of achieved, proposed, got 'nothing'"):
-        BehaviorGoals(REWARD, update_on="nothing")  # type: ignore[arg-type]
+        GoalProposal(update_on="nothing")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="2 runs need a list of 2 weights, one for each run, got 1"):
-        BehaviorGoals(REWARD, runs=2, weights=Told(1.0), generators=[torch.Generator()] * 2)
+        BehaviorGoals(
+            REWARD, runs=2, proposal=GoalProposal(weights=Told(1.0)), generators=[torch.Generator()] * 2
+        )
 
 
 def test_missing_entries() -> None:
@@ -370,11 +381,13 @@ def test_it_works_where_the_environments_are(
 
         behavior = BehaviorGoals(
             REWARD,
-            weights=[RareGoals(k=2, estimator="neighbors"), RareGoals(k=2, estimator="neighbors")],
-            factors=[ValueCutoff(nearness, runs=2), DiscoverScore(nearness, runs=2)],
+            proposal=GoalProposal(
+                weights=[RareGoals(k=2, estimator="neighbors"), RareGoals(k=2, estimator="neighbors")],
+                factors=[ValueCutoff(nearness, runs=2), DiscoverScore(nearness, runs=2)],
+                greedy=True,
+                candidates=20,
+            ),
             real_share=0.3,
-            greedy=True,
-            candidates=20,
             memory=100,
             runs=2,
             generators=generators,
@@ -391,7 +404,9 @@ def test_it_works_where_the_environments_are(
 
 
 def test_a_single_environment_without_a_batch() -> None:
-    behavior = BehaviorGoals(REWARD, weights=Told(3.0), real_share=0.0, generators=[torch.Generator()])
+    behavior = BehaviorGoals(
+        REWARD, proposal=GoalProposal(weights=Told(3.0)), real_share=0.0, generators=[torch.Generator()]
+    )
     behavior._step(
         TensorDict({"proposed": torch.tensor([False]), "proposed_reached": torch.tensor([False])}, []),
         TensorDict(

@@ -8,7 +8,14 @@ from typing import Any
 
 from torchrl.envs import EnvBase
 
-from torchrl_her.behavior import BehaviorGoals, DiscoverScore, GoalValues, InverseDensity, ValueCutoff
+from torchrl_her.behavior import (
+    BehaviorGoals,
+    DiscoverScore,
+    GoalProposal,
+    GoalValues,
+    InverseDensity,
+    ValueCutoff,
+)
 from torchrl_her.curriculum.transforms import ZeroPad
 from torchrl_her_envs.common.goal_env import goal_env, reward_range
 from torchrl_her_recipes.components.curricula import CurriculumState, at_the_top
@@ -21,7 +28,6 @@ from torchrl_her_recipes.config.choices.behavior import IBS, Behavior, Discover,
 from torchrl_her_recipes.config.choices.learners import LearnerConfig
 from torchrl_her_recipes.config.values import load_name
 
-MakeGoals = Callable[..., BehaviorGoals]
 MakeValues = Callable[[], GoalValues]
 
 
@@ -46,10 +52,10 @@ def make_behavior(
     values = partial(
         GoalValues, agent.loss, agent.actor, runs=runs, before_actor=pad, before_critic=agent.norm
     )
-    goals = partial(_goals, seeds, env, **keywords)
-    behavior: BehaviorGoals = load_name(options.maker)(
-        options, goals, learner=learner, runs=runs, rewards=rewards, space=space, values=values
+    proposal = load_name(options.maker)(
+        options, learner=learner, runs=runs, rewards=rewards, space=space, values=values
     )
+    behavior = _goals(seeds, env, proposal=proposal, **keywords)
     if state is not None:
         for run in range(runs):
             behavior.set_active(state.at_the_top(run), run=run)
@@ -58,7 +64,9 @@ def make_behavior(
 
 def make_asking(seeds: Sequence[int], env: EnvBase, *, memory: int) -> BehaviorGoals:
     """Makes a transform for evaluation: episodes get goals that the caller has put into its memory."""
-    return _goals(seeds, env, remember=False, real_share=0.0, candidates=1, memory=memory)
+    return _goals(
+        seeds, env, proposal=GoalProposal(candidates=1), remember=False, real_share=0.0, memory=memory
+    )
 
 
 def _goals(seeds: Sequence[int], env: EnvBase, **options: Any) -> BehaviorGoals:
@@ -72,31 +80,24 @@ def _goals(seeds: Sequence[int], env: EnvBase, **options: Any) -> BehaviorGoals:
     )
 
 
-def make_uniform(_options: Proposed, goals: MakeGoals, **_: Any) -> BehaviorGoals:
-    """Makes a transform that proposes any achieved goal, with equal probability."""
-    return goals()
+def make_uniform(_options: Proposed, **_: Any) -> GoalProposal:
+    """Makes a proposal of any achieved goal, with equal probability."""
+    return GoalProposal()
 
 
-def make_ibs(options: IBS, goals: MakeGoals, *, runs: int, space: Any, **_: Any) -> BehaviorGoals:
-    """Makes a transform that proposes goals in proportion to q* (share in the task) - q (share so far)."""
+def make_ibs(options: IBS, *, runs: int, space: Any, **_: Any) -> GoalProposal:
+    """Makes a proposal of goals in proportion to q* (share in the task) - q (share so far)."""
     weights = [make_instructive(options, space=space) for _ in range(runs)]
-    return goals(weights=weights, update_on="proposed", candidates=options.candidates)
+    return GoalProposal(weights=weights, update_on="proposed", candidates=options.candidates)
 
 
 def make_mega(
-    options: Mega,
-    goals: MakeGoals,
-    *,
-    learner: LearnerConfig,
-    runs: int,
-    rewards: Any,
-    values: MakeValues,
-    **_: Any,
-) -> BehaviorGoals:
-    """Makes a transform that proposes the rarest achieved goal whose value exceeds a cutoff."""
+    options: Mega, *, learner: LearnerConfig, runs: int, rewards: Any, values: MakeValues, **_: Any
+) -> GoalProposal:
+    """Makes a proposal of the rarest achieved goal whose value exceeds a cutoff."""
     cutoffs = scaled_cutoffs(options.cutoff, learner.gamma, rewards)
     factors = [InverseDensity(), ValueCutoff(values(), runs=runs, **cutoffs)]
-    return goals(factors=factors, greedy=True, candidates=options.candidates)
+    return GoalProposal(factors=factors, greedy=True, candidates=options.candidates)
 
 
 def scaled_cutoffs(cutoff: float, gamma: float, rewards: tuple[float, float]) -> dict[str, float]:
@@ -112,10 +113,10 @@ def scaled_cutoffs(cutoff: float, gamma: float, rewards: tuple[float, float]) ->
 
 
 def make_discover(
-    options: Discover, goals: MakeGoals, *, learner: LearnerConfig, runs: int, values: MakeValues, **_: Any
-) -> BehaviorGoals:
-    """Makes a transform that proposes new, achievable goals that lead toward the task's goal (DISCOVER)."""
+    options: Discover, *, learner: LearnerConfig, runs: int, values: MakeValues, **_: Any
+) -> GoalProposal:
+    """Makes a proposal of new, achievable goals that lead toward the task's goal (DISCOVER)."""
     several = getattr(learner, "critics", 1) > 1  # a goal is new if critics disagree on its value
     score = DiscoverScore(values(), runs=runs)
     factors = [score] if several else [InverseDensity(), score]
-    return goals(factors=factors, greedy=True, candidates=options.candidates)
+    return GoalProposal(factors=factors, greedy=True, candidates=options.candidates)

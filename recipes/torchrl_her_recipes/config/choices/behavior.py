@@ -31,9 +31,8 @@ class Real(Behavior):
 class Proposed(Behavior):
     """Base class of choices that replace the task's goal, in some episodes, by a goal achieved earlier.
 
-    The maker takes these options and a function ``goals``. It returns the result of calling ``goals`` with
-    arguments of :class:`~torchrl_her.behavior.BehaviorGoals`, such as ``weights`` or ``factors``. Keyword
-    arguments of the maker:
+    The maker takes these options and returns a :class:`~torchrl_her.behavior.GoalProposal`. Its keyword
+    arguments:
 
     - ``learner``: options of the learner;
     - ``runs``: number of runs;
