@@ -78,6 +78,11 @@ def theirs(method: str, task: str, name: str) -> Curves:
     return read_curves("relay_her", {"method": method, "task": task}, name, window=4, episodes=10)
 
 
+def mirrored(task: str) -> Curves:
+    """Runs that know the symmetries of a task."""
+    return ours(f"symmetries of {task}", "default agent with symmetries")
+
+
 def defaults(task: str) -> list[Curves]:
     """Runs of the default agent on a task: as it is now, and with its earlier decay of epsilon."""
     return [
@@ -92,6 +97,7 @@ def boards() -> dict[str, list[Curves]]:
         "FetchPush": [
             *defaults("FetchPush"),
             ours("default agent, one stage after the other", "the same, one stage after the other"),
+            mirrored("FetchPush"),
             theirs("RHER", "FetchPush", "Relay-HER"),
             theirs("DDPG+HER", "FetchPush", "DDPG and HER, by Relay-HER's authors"),
         ],
@@ -101,6 +107,7 @@ def boards() -> dict[str, list[Curves]]:
                 "default agent, one stage after the other, on FetchPickAndPlace",
                 "one stage after the other, seeds 0 to 2",
             ),
+            mirrored("FetchPickAndPlace"),
             theirs("RHER", "FetchPickAndPlace", "Relay-HER"),
             theirs("DDPG+HER", "FetchPickAndPlace", "DDPG and HER, by Relay-HER's authors"),
         ],
