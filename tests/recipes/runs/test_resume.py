@@ -146,6 +146,10 @@ def test_a_run_that_is_killed_at_any_moment_ends_bit_for_bit_as_one_that_was_not
             {"task": "hand_v1", "num_runs": 2, "goal_sources": {"future": 1, "actual": 2, "achieved": 2}},
             id="goals of other episodes",
         ),
+        pytest.param(
+            {"task": "hand_v1", "num_runs": 2, "symmetry": {"mirror": {0: 0.0}, "mirror_action": [0]}},
+            id="mirror images",
+        ),
         pytest.param({"sampler": "uniform", "hard_update_interval": 7, "norm": "batch"}, id="hard updates"),
         pytest.param(
             {"learner": "redq", "critics": 3, "frames_per_update": 0.7, "epoch_frames": 240}
