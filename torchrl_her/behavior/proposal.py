@@ -11,7 +11,7 @@ from torchrl_her.behavior.factors import GoalCandidates, GoalFactor
 from torchrl_her.checks import check_whole
 from torchrl_her.goals.factors import draw
 from torchrl_her.goals.instructive import InstructiveWeights
-from torchrl_her.goals.weights import GoalWeights, WeightsOfRuns, checked_weights
+from torchrl_her.goals.weights import GoalWeights, WeightsOfRuns, checked_weights, weights_by_run
 from torchrl_her.randomness import Generators, RunDraws
 
 UpdateOn = Literal["achieved", "proposed"]
@@ -58,15 +58,8 @@ class GoalProposal:
         check_whole(candidates=candidates)
         if update_on not in get_args(UpdateOn):
             raise ValueError(f"update_on must be one of {', '.join(get_args(UpdateOn))}, got {update_on!r}")
-        self.weights = (
-            [] if weights is None else [weights] if isinstance(weights, GoalWeights) else list(weights)
-        )
-        self.update_on, self.factors, self.greedy, self.candidates = (
-            update_on,
-            list(factors),
-            greedy,
-            candidates,
-        )
+        self.weights, self.update_on = weights_by_run(weights), update_on
+        self.factors, self.greedy, self.candidates = list(factors), greedy, candidates
 
     @property
     def samples(self) -> int:
@@ -87,10 +80,13 @@ class GoalProposal:
             place, valid = draw(likelihood, 1, generator=RunDraws(generators, candidates.run))
         return candidates.goals.take_along_dim(place.unsqueeze(-1), 1).squeeze(1), valid
 
-    def update(self, on: UpdateOn, goals: Tensor, counts: Sequence[int]) -> None:
-        """Updates the weights on goals [m, g] that were achieved or proposed, sorted by run."""
-        if self.weights and self.update_on == on:
-            self._of_runs().update(goals, range(len(counts)), counts)
+    def is_updated_on(self, on: UpdateOn) -> bool:
+        """Returns whether there are weights that are updated on such goals."""
+        return bool(self.weights) and self.update_on == on
+
+    def update(self, goals: Tensor, counts: Sequence[int]) -> None:
+        """Updates the weights on goals [m, g], sorted by run."""
+        self._of_runs().update(goals, range(len(counts)), counts)
 
     def restart(self, run: int) -> None:
         """Begins anew with the weights of a run."""

@@ -55,6 +55,7 @@ class BehaviorGoals(Transform):
         continues_after_termination: whether the environment can be stepped further after it terminated an
             episode; if not, the episode is truncated there.
         keys: keys of the entries that are read. All are also written, except observation and achieved goal.
+        real_goal_key: key under which the task's own goal is written.
         stage_key: key of the stage [..., 1] that an episode is played in, if episodes have stages.
         stage: index of the stage in which goals are proposed.
 
@@ -95,6 +96,7 @@ class BehaviorGoals(Transform):
         achieved_reward: float = 0.0,
         continues_after_termination: bool = False,
         keys: EnvKeys = EnvKeys(),
+        real_goal_key: NestedKey = "real_desired_goal",
         stage_key: NestedKey | None = None,
         stage: int = 0,
     ) -> None:
@@ -104,7 +106,7 @@ class BehaviorGoals(Transform):
         weights_by_run(self.proposal.weights, runs)
         keys.check_ends(continues_after_termination=continues_after_termination)
         in_keys = [keys.observation, keys.achieved_goal, keys.desired_goal]
-        out_keys = [keys.desired_goal, "real_desired_goal", PROPOSED, PROPOSED_REACHED]
+        out_keys = [keys.desired_goal, real_goal_key, PROPOSED, PROPOSED_REACHED]
         super().__init__(in_keys=in_keys, out_keys=out_keys)
         self.generators: Generators = check_generators(runs, generators) or [None]
         self.reward_fn, self.remember, self.real_share = reward_fn, remember, real_share
@@ -243,8 +245,9 @@ class BehaviorGoals(Transform):
         if part is not None and not bool(part.any()):
             return
         self.memory.add(achieved, _rows(self._get(after, self.in_keys[0])), which=part)
-        goals = achieved if part is None else achieved[part]
-        self.proposal.update("achieved", goals, self._counts(part, len(achieved)))
+        if self.proposal.is_updated_on("achieved"):
+            goals = achieved if part is None else achieved[part]
+            self.proposal.update(goals, self._counts(part, len(achieved)))
 
     def _propose(self, tensordict: TensorDictBase, begins: Tensor) -> tuple[Tensor, Tensor | None]:
         """Returns which of the environments [N] get a proposed goal, and these goals [m, g]."""
@@ -271,7 +274,8 @@ class BehaviorGoals(Transform):
         if not bool(valid.all()):  # environments without a valid goal keep the task's
             chosen, goals = chosen.index_put((chosen.clone(),), valid), goals[valid]
             counts = self._counts(chosen, len(begins))
-        self.proposal.update("proposed", goals, counts)
+        if self.proposal.is_updated_on("proposed"):
+            self.proposal.update(goals, counts)
         return chosen, goals
 
     def _sample(self, counts: Sequence[int]) -> Sequence[Tensor]:

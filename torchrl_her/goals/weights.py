@@ -91,14 +91,16 @@ class WeightsOfRuns:
                 self.weights[run].update(part)
 
 
-def weights_by_run(weights: GoalWeights | Sequence[GoalWeights] | None, runs: int) -> list[GoalWeights]:
-    """Returns the weights of R runs as a list; an empty list for None.
+def weights_by_run(
+    weights: GoalWeights | Sequence[GoalWeights] | None, runs: int | None = None
+) -> list[GoalWeights]:
+    """Returns the weights of R runs, or of any number of runs, as a list; an empty list for None.
 
     Raises:
         ValueError: the number of weights is not R.
     """
     run_weights = list(weights) if isinstance(weights, Sequence) else [] if weights is None else [weights]
-    if run_weights and len(run_weights) != runs:
+    if runs is not None and run_weights and len(run_weights) != runs:
         raise ValueError(
             f"{runs} runs need a list of {runs} weights, one for each run, got {len(run_weights)}"
         )

@@ -54,8 +54,7 @@ class Symmetry:
     def __post_init__(self) -> None:
         if not self.mirror and not self.shifts:
             raise ValueError("a symmetry needs columns that are mirrored or shifted, got none")
-        shifted = [each for shift in self.shifts for each in shift.columns]
-        for each in (*self.mirror, *self.mirror_action, *shifted):
+        for each in (*self.columns, *self.mirror_action):
             if not isinstance(each, int) or each < 0:
                 raise ValueError(f"columns of a symmetry must be whole numbers from 0 on, got {each!r}")
         for value in self.mirror.values():
@@ -65,13 +64,14 @@ class Symmetry:
             if not 0 < shift.most < math.inf:
                 raise ValueError(f"most of a shift must be positive and finite, got {shift.most}")
 
+    @property
+    def columns(self) -> list[int]:
+        """All columns of the state that are mirrored or shifted."""
+        return [*self.mirror, *(each for shift in self.shifts for each in shift.columns)]
+
     def check(self, *, state: int, action: int) -> None:
         """Raises a ValueError if a column is not one of a state or an action of the given widths."""
-        shifted = [each for shift in self.shifts for each in shift.columns]
-        for name, columns, width in (
-            ("state", [*self.mirror, *shifted], state),
-            ("action", self.mirror_action, action),
-        ):
+        for name, columns, width in (("state", self.columns, state), ("action", self.mirror_action, action)):
             if columns and max(columns) >= width:
                 raise ValueError(
                     f"the {name} has the columns 0 to {width - 1}, but the symmetry has {max(columns)}"
@@ -158,6 +158,7 @@ class AugmentBatch(Transform):
                 mirrored, added = mirrored[stage], added[stage]
             sign, plus = 1 - 2 * mirror * mirrored, (drawn.unsqueeze(-2) @ added).squeeze(-2)
             for part in (tensordict, tensordict.get("next")):
-                part.set(key, (part.get(key) * sign + plus).to(part.get(key).dtype))
+                entry = part.get(key)
+                part.set(key, (entry * sign + plus).to(entry.dtype))
         turned = self._turned.to(action.device, action.dtype)
         return tensordict.set(self.action_key, action * (1 - 2 * mirror.to(action.dtype) * turned))
