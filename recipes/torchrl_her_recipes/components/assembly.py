@@ -85,7 +85,7 @@ def build(recipe: Recipe) -> Components:
         make_buffer, recipe, task, generators, space=space, state=state, norm=agent.norm, devices=devices
     )
     if demonstrations is not None and recipe.demonstrations.in_batches:
-        capacity = rows_needed(recipe.hindsight, demonstrations)
+        capacity = rows_needed(recipe, demonstrations)
         demonstrations.fill(replay(capacity=capacity), len(seeds))
     virtual = recipe.evaluation.virtual_goals
     return Components(
