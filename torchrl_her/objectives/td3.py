@@ -36,7 +36,8 @@ class PenalizedTD3Loss(TD3Loss):
         noise: source of the loss's random numbers.
 
     Raises:
-        ValueError: ``target_critics`` is not from 0 to the number of critics.
+        ValueError: ``target_critics`` is not from 0 to the number of critics, or ``target_noise`` is
+            negative.
     """
 
     def __init__(
@@ -49,6 +50,8 @@ class PenalizedTD3Loss(TD3Loss):
         noise: RunNoise | None = None,
         **kwargs: Any,
     ) -> None:
+        if not target_noise >= 0:
+            raise ValueError(f"target_noise must be at least 0, got {target_noise}")
         super().__init__(*args, policy_noise=0.0, noise_clip=0.0, **kwargs)
         self.terms = terms
         self.target_critics = checked_subset(target_critics, self.num_qvalue_nets)
@@ -110,6 +113,7 @@ def make_td3_loss(
     *,
     action_spec: Bounded,
     target_critics: int = 0,
+    target_noise: float = 0.2,
     targets: Targets = Targets(reward_range=(-1.0, 0.0)),
     terms: ActorTerms = ActorTerms(),
     generators: Sequence[torch.Generator] | None = None,
@@ -128,13 +132,16 @@ def make_td3_loss(
         action_spec: spec of one environment's action, with its bounds.
         target_critics: number of critics drawn at random in each gradient step, whose least value targets
             use; 0 for all. Chen et al., Randomized ensembled double Q-learning, 2021.
+        target_noise: standard deviation of the noise on the target's actions, in their own unit. It blurs
+            values over actions: use 0 where a little of an action decides.
         targets: discount, and the range of rewards; targets are clamped to the returns it allows.
         terms: further terms of the actor's loss.
         generators: generators of the random numbers of each run; None for torch's own.
         reduction: ``"none"`` gives one loss for each transition [R, B], as stacked networks need it.
 
     Raises:
-        ValueError: the list of critics is empty, or ``target_critics`` is not from 0 to their number.
+        ValueError: the list of critics is empty, ``target_critics`` is not from 0 to their number, or
+            ``target_noise`` is negative.
 
     Example:
         >>> from torchrl_her import make_actor, make_critic
@@ -153,6 +160,7 @@ def make_td3_loss(
         loss_function="l2",
         terms=terms,
         target_critics=target_critics,
+        target_noise=target_noise,
         noise=RunNoise(generators),
         reduction=reduction,
     )

@@ -88,6 +88,7 @@ class TD3Builder(DDPGBuilder):
             critics,
             action_spec=self.action_spec.to(place_of(actor)),
             target_critics=self.options.target_critics,
+            target_noise=self.options.target_noise,
             generators=self.generators,
             **self.loss_options(),
         )

@@ -61,13 +61,14 @@ def test_options_reach_the_loss_and_the_exploration() -> None:
             learner="td3",
             critics=5,
             target_critics=2,
+            target_noise=0.3,
             action_noise=0.1,
             uniform_share=0.3,
             epsilon_start=1.0,
             epsilon_end=1.0,
         )
     )
-    assert (td3.loss.num_qvalue_nets, td3.loss.target_critics) == (5, 2)
+    assert (td3.loss.num_qvalue_nets, td3.loss.target_critics, td3.loss.target_noise) == (5, 2, 0.3)
     assert (td3.exploration.noise, td3.exploration.uniform_share) == (0.1, 0.3)
     redq = build(small(task="hand_v0", learner="redq", clamp_targets=True, gamma=0.9))
     assert (redq.loss.num_qvalue_nets, redq.loss.target_critics) == (10, 2)

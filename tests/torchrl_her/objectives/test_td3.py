@@ -40,6 +40,7 @@ SUBSET = r"target_critics must be from 0 \(all\) to the number of critics, 3, go
     [
         ({"critics": 3, "target_critics": -1}, f"{SUBSET}-1"),
         ({"critics": 3, "target_critics": 4}, f"{SUBSET}4"),
+        ({"target_noise": -0.1}, r"target_noise must be at least 0, got -0\.1"),
     ],
 )
 def test_what_cannot_be_is_named(options: dict[str, Any], message: str) -> None:
@@ -95,6 +96,14 @@ def test_the_targets_of_a_run_have_its_own_noise() -> None:
     first = loss.noise(torch.zeros(2, 5, 3))
     alone = torch.Generator().manual_seed(2)
     assert torch.equal(first[1].flatten(), torch.empty(15).normal_(generator=alone))
+
+
+def test_without_target_noise_targets_value_the_actors_own_action() -> None:
+    """The target of the same row twice; noise makes them differ."""
+    batch = rows(1, action=torch.rand(1, 1, 3))[0].expand(2).clone()
+    for noise, same in ((0.0, True), (0.2, False)):
+        first, second = make_loss(target_noise=noise)(batch)["target_value"].tolist()
+        assert (first == second) is same
 
 
 def test_targets_of_critics_that_are_drawn_and_the_mean_for_the_actor() -> None:

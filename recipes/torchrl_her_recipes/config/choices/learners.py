@@ -191,6 +191,9 @@ class TD3Config(_SomeCritics, DDPGConfig):
     maker = f"{_MAKERS}:TD3Builder"
 
     norm: str = _norm()
+    target_noise: float = option(
+        0.2, "standard deviation of noise on the targets' actions, which blurs values", at_least=0
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
