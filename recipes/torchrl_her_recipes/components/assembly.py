@@ -51,7 +51,7 @@ def build(recipe: Recipe) -> Components:
     progress = make_progress(recipe.order, envs.curriculum, task, seeds)
     check_order(recipe.order, progress, recipe.weights, processes)
     tests, test_seeds = evaluation_envs(recipe.task.name, recipe.evaluation.episodes), eval_seeds(seeds, 0)
-    state = make_curriculum_state(progress, envs, tests, test_seeds)
+    state = make_curriculum_state(recipe.order, progress, envs, tests, test_seeds)
     space = goal_space(recipe.weights, envs, task, collection.num_envs)
     demonstrations = load_demonstrations(recipe.demonstrations, envs, task, seeds, state)
     played = partial(make_played_env, envs, tests, test_seeds)
@@ -85,7 +85,7 @@ def build(recipe: Recipe) -> Components:
         make_buffer, recipe, task, generators, space=space, state=state, norm=agent.norm, devices=devices
     )
     if demonstrations is not None and recipe.demonstrations.in_batches:
-        capacity = rows_needed(recipe, demonstrations)
+        capacity = rows_needed(recipe.hindsight, demonstrations)
         demonstrations.fill(replay(capacity=capacity), len(seeds))
     virtual = recipe.evaluation.virtual_goals
     return Components(

@@ -94,7 +94,7 @@ def make_buffer(
             weights=[weight for weight in weights if weight is not None] or None,
             runs=runs,
             generators=generators,
-            stages=_rules(state, task_reward(env), every=getattr(recipe.order, "every_stage", False)),
+            stages=_rules(state, task_reward(env)),
             on_write=counted,
         ),
         sampler=_make_sampler(recipe.replay, recipe.learner.priority_power, generators, size, devices.replay),
@@ -129,16 +129,12 @@ def _make_writer(options: HindsightConfig, env: EnvBase, **others: Any) -> HERWr
     )
 
 
-def _rules(state: CurriculumState | None, task: RewardFunction, *, every: bool) -> list[StageRule] | None:
-    """Returns a rule for relabeling in each stage, if episodes have stages of their own; else None.
-
-    Args:
-        every: whether each episode is stored for all stages, not only for its own.
-    """
+def _rules(state: CurriculumState | None, task: RewardFunction) -> list[StageRule] | None:
+    """Returns a rule for relabeling in each stage, if episodes have stages of their own; else None."""
     if state is None or not state.progress.by_episode:
         return None
     rules = [StageRule(stage.reward_fn or task, stage.instructive) for stage in state.curriculum.stages]
-    if not every:
+    if not state.every_stage:
         return rules
     views = [StageView(state.curriculum, number, rule.reward_fn) for number, rule in enumerate(rules)]
     return [rule._replace(view=view) for rule, view in zip(rules, views, strict=True)]

@@ -32,10 +32,12 @@ class CurriculumState:
         progress: the stage of each run.
         stage_env: environments that evaluate each run at the goals of its stage; None if each episode has a
             stage of its own.
+        every_stage: whether each episode is stored for all stages, not only for its own.
     """
 
     progress: CurriculumProgress
     stage_env: EnvBase | None
+    every_stage: bool
 
     @property
     def curriculum(self) -> Curriculum:
@@ -99,13 +101,14 @@ def _read_stage(options: Any, env: GoalEnv, *, is_last: bool) -> CurriculumStage
 
 
 def make_curriculum_state(
-    progress: CurriculumProgress | None, envs: TaskEnvs, num_envs: int, seeds: Sequence[int]
+    order: Order, progress: CurriculumProgress | None, envs: TaskEnvs, num_envs: int, seeds: Sequence[int]
 ) -> CurriculumState | None:
     """Makes the state of runs from their progress, with ``num_envs`` environments for each run, or None."""
     if progress is None:
         return None
     by_run = not isinstance(progress, EpisodeStages)
-    return CurriculumState(progress, in_stages(envs.make(num_envs, seeds), progress) if by_run else None)
+    stage_env = in_stages(envs.make(num_envs, seeds), progress) if by_run else None
+    return CurriculumState(progress, stage_env, getattr(order, "every_stage", False))
 
 
 def check_order(order: Order, progress: CurriculumProgress | None, weights: Weights, processes: int) -> None:

@@ -21,8 +21,7 @@ from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_recipes.components.curricula import CurriculumState
 from torchrl_her_recipes.components.envs import TaskEnvs, action_bounds, task_reward
 from torchrl_her_recipes.components.streams import Stream, generators_of
-from torchrl_her_recipes.config.groups import DemonstrationsConfig
-from torchrl_her_recipes.config.recipe import Recipe
+from torchrl_her_recipes.config.groups import DemonstrationsConfig, HindsightConfig
 
 
 @dataclass
@@ -180,10 +179,9 @@ def make_cloning(options: DemonstrationsConfig) -> Cloning | None:
     return Cloning(weight=options.bc_weight, q_filter=options.q_filter)
 
 
-def rows_needed(recipe: Recipe, demonstrations: RunDemonstrations) -> int:
+def rows_needed(hindsight: HindsightConfig, demonstrations: RunDemonstrations) -> int:
     """Returns the largest number of rows that a run's demonstrations can fill, virtual rows included."""
-    hindsight, state = recipe.hindsight, demonstrations.state
     copies = sum(hindsight.sources.values()) * hindsight.refill if hindsight.algorithm.virtual else 0
-    every = getattr(recipe.order, "every_stage", False)
-    stages = len(state.curriculum) if state is not None and every else 1
+    state = demonstrations.state
+    stages = len(state.curriculum) if state is not None and state.every_stage else 1
     return len(demonstrations.recorded.rows) * (1 + copies) * stages
