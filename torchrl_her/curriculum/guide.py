@@ -43,6 +43,8 @@ class GuidedExploration(TensorDictModuleBase):
 
     Keyword Args:
         share: fraction of episodes, or of steps, that are guided. Episodes in the first stage do not count.
+        decay: factor by which the share shrinks in each :meth:`step`. Guidance teaches what the next stage
+            begins with, and then keeps the policy from its own way there, such as a run-up.
         per: whether guidance is drawn for each ``"episode"`` or for each ``"step"``.
         runs: R; the weights of R runs are stacked, along the first dimension of each parameter.
         generators: generators, one for each run, or None for torch's own.
@@ -51,13 +53,15 @@ class GuidedExploration(TensorDictModuleBase):
             beginning of an episode.
 
     Attributes:
+        share: the present fraction of episodes, or of steps.
         stage: [R], the stage whose policy begins a run's episodes; -1 while there is none. Not used if
             episodes have stages of their own.
         guided: [B, 1], the stage whose policy now acts in each environment; -1 where the guide does not act.
             None before the first step.
 
     Raises:
-        ValueError: the share is outside of [0, 1], or ``per`` is neither ``"episode"`` nor ``"step"``.
+        ValueError: the share is outside of [0, 1], the decay outside of (0, 1], or ``per`` is neither
+            ``"episode"`` nor ``"step"``.
 
     Example:
         >>> from tensordict.nn import TensorDictModule, TensorDictSequential
@@ -79,6 +83,7 @@ class GuidedExploration(TensorDictModuleBase):
     """
 
     stage: Tensor
+    share: Tensor
 
     def __init__(
         self,
@@ -86,6 +91,7 @@ class GuidedExploration(TensorDictModuleBase):
         curriculum: Curriculum,
         *,
         share: float = 0.5,
+        decay: float = 1.0,
         per: Literal["episode", "step"] = "episode",
         runs: int = 1,
         generators: Sequence[torch.Generator] | None = None,
@@ -96,6 +102,8 @@ class GuidedExploration(TensorDictModuleBase):
     ) -> None:
         if not 0.0 <= share <= 1.0:
             raise ValueError(f"share must be in [0, 1], got {share}")
+        if not 0.0 < decay <= 1.0:
+            raise ValueError(f"decay must be in (0, 1], got {decay}")
         if per not in ("episode", "step"):
             raise ValueError(f"per must be episode or step, got {per!r}")
         super().__init__()
@@ -106,15 +114,20 @@ class GuidedExploration(TensorDictModuleBase):
         else:
             self.in_keys.append(stage_key)
             self._policy = (policy,)  # in a tuple, since a submodule's weights would be registered twice
-        self.relay, self.share, self.per = Relay(curriculum), share, per
+        self.relay, self.decay, self.per = Relay(curriculum), decay, per
         self.generators = [None] * runs if generators is None else list(generators)
         self.register_buffer("stage", torch.full((runs,), -1))
+        self.register_buffer("share", torch.tensor(share, dtype=torch.float64))
         self.guided: Tensor | None = None
 
     @property
     def guide(self) -> TensorDictModuleBase:
         """The policy that begins episodes."""
         return self.module if self.stage_key is None else self._policy[0]
+
+    def step(self) -> None:
+        """Multiplies the share by ``decay``; to be called at the end of each epoch."""
+        self.share.mul_(self.decay)
 
     @torch.no_grad()
     def follow(self, policy: TensorDictModuleBase, stage: int, *, run: int = 0) -> None:

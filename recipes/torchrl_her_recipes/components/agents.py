@@ -140,6 +140,7 @@ def _guide_of(
         policy,
         state.curriculum,
         share=options.guided_share,
+        decay=options.guided_decay,
         per=cast(Literal["episode", "step"], options.guided_per),
         stage_key="stage" if state.progress.by_episode else None,
         runs=runs,

@@ -160,6 +160,7 @@ class Components(Agent):
             learner=self.learner(),
             schedules=[
                 self.exploration,
+                *([] if self.guide is None else [self.guide]),
                 *(weight for weight in weights if isinstance(weight, InstructiveWeights)),
                 *rising_beta(self.buffer.sampler, replay.priority_beta_end, recipe.run.epochs),
             ],

@@ -229,7 +229,7 @@ class HindsightConfig(Group):
 class CurriculumConfig(Group):
     """The stages that runs learn, one after the other or at once (Curriculum-HER)."""
 
-    needs: ClassVar[Needs] = (("guided_share", bool, "guided_per"),)
+    needs: ClassVar[Needs] = (("guided_share", bool, "guided_per"), ("guided_share", bool, "guided_decay"))
 
     name: str = option(
         "task",
@@ -248,6 +248,7 @@ class CurriculumConfig(Group):
         "what guided_share is a share of: episodes, or steps before the previous stage's goal is achieved",
         choices=("episode", "step"),
     )
+    guided_decay: float = option(1.0, "factor by which guided_share shrinks each epoch", above=0, at_most=1)
     alpha_actor: float = option(
         0.0, "scale of the actor's initial weights for inputs that the first stage does not use", at_least=0
     )

@@ -36,6 +36,7 @@ ALL: dict[str, Any] = {
     "window": 10,
     "success_threshold": 0.01,
     "guided_share": 0.5,
+    "guided_decay": 0.5,
     "norm": "none",
     "normalize": False,
 }

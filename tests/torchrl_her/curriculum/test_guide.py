@@ -86,10 +86,20 @@ def test_by_the_step_it_acts_wherever_the_goal_below_is_not_achieved() -> None:
     guide.follow(policy(2.0), 0)
     assert acts(guide, [[3.0, 5.0, 7.0], [0.0, 0.4, 0.0]], begun=False) == [106.0, -1.0]
     assert acts(guide, [[4.6, 5.0, 7.0], [0.0, 1.0, 0.0]], begun=False) == [-1.0, 20.0]
-    guide.share = 0.5
+    guide.share.fill_(0.5)
     acted = torch.tensor([acts(guide, [[3.0, 5.0, 7.0]] * 40, begun=False) for _ in range(10)]) > 0
     assert 0.4 < acted.double().mean() < 0.6
     assert not acted.all(0).any()  # in no environment always
+
+
+def test_its_share_shrinks_with_each_epoch() -> None:
+    guide = GuidedExploration(policy(1.0), CURRICULUM, share=0.8, decay=0.5, per="step")
+    guide.follow(policy(2.0), 0)
+    guide.step()
+    guide.step()
+    acted = torch.tensor(acts(guide, [[3.0, 5.0, 7.0]] * 1000)) > 0
+    assert float(guide.share) == 0.2
+    assert 0.15 < acted.double().mean() < 0.25
 
 
 def test_without_a_stage_below_it_does_nothing() -> None:
@@ -208,6 +218,12 @@ def test_a_share_of_the_episodes_above_is_begun() -> None:
 def test_impossible_shares_are_refused(share: float) -> None:
     with pytest.raises(ValueError, match=r"share must be in \[0, 1\], got"):
         GuidedExploration(policy(1.0), CURRICULUM, share=share)
+
+
+@pytest.mark.parametrize("decay", [0.0, 1.1])
+def test_impossible_decays_are_refused(decay: float) -> None:
+    with pytest.raises(ValueError, match=rf"decay must be in \(0, 1\], got {decay}"):
+        GuidedExploration(policy(1.0), CURRICULUM, decay=decay)
 
 
 @pytest.fixture
