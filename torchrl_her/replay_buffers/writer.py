@@ -171,6 +171,8 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
         for rule in self.stages:
             if not isinstance(rule, StageRule):
                 raise TypeError(f"stages must be a list of StageRule, got {rule!r} in it")
+            if not 0.0 <= rule.share <= 1.0:
+                raise ValueError(f"the share of a StageRule must be in [0, 1], got {rule.share}")
         check_whole(refill=refill, least=1)
         self.refill = refill
         run_weights = weights_by_run(weights, runs)
@@ -431,7 +433,8 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
         entries = max(1, min(_ROWS, self.capacity) // most), _ROWS // most
         episode_runs = None if run is None else run[episodes.rows[:, :1]].flatten()
         recent, settings, drafts, first_id = list(self._recent), self._settings(), [], self._episodes
-        parts = split_stages(rows, episodes, episode_runs, self._keys.stage, self.stages)
+        generators = [self._rng] if self.generators is None else self.generators
+        parts = split_stages(rows, episodes, episode_runs, self._keys.stage, self.stages, generators)
         for stage, stage_rows, part, run_of in parts:
             recent_goals = recent[stage].after(
                 stage_rows, part, run_of, self._keys, sizes=self.options.remembered

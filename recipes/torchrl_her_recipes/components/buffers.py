@@ -134,10 +134,11 @@ def _rules(state: CurriculumState | None, task: RewardFunction) -> list[StageRul
     if state is None or not state.progress.by_episode:
         return None
     rules = [StageRule(stage.reward_fn or task, stage.instructive) for stage in state.curriculum.stages]
-    if not state.every_stage:
+    if state.stored_shares is None:
         return rules
     views = [StageView(state.curriculum, number, rule.reward_fn) for number, rule in enumerate(rules)]
-    return [rule._replace(view=view) for rule, view in zip(rules, views, strict=True)]
+    shared = zip(rules, views, state.stored_shares, strict=True)
+    return [rule._replace(view=view, share=share) for rule, view, share in shared]
 
 
 def _goals(options: HindsightConfig) -> dict[str, Any]:

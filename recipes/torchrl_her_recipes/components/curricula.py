@@ -32,12 +32,13 @@ class CurriculumState:
         progress: the stage of each run.
         stage_env: environments that evaluate each run at the goals of its stage; None if each episode has a
             stage of its own.
-        every_stage: whether each episode is stored for all stages, not only for its own.
+        stored_shares: share of the episodes that are stored for each stage, besides those that were played in
+            it; None if no others are.
     """
 
     progress: CurriculumProgress
     stage_env: EnvBase | None
-    every_stage: bool
+    stored_shares: list[float] | None
 
     @property
     def curriculum(self) -> Curriculum:
@@ -108,7 +109,10 @@ def make_curriculum_state(
         return None
     by_run = not isinstance(progress, EpisodeStages)
     stage_env = in_stages(envs.make(num_envs, seeds), progress) if by_run else None
-    return CurriculumState(progress, stage_env, getattr(order, "every_stage", False))
+    shares = None
+    if getattr(order, "every_stage", False):
+        shares = [getattr(order, "lower_share", 1.0)] * (len(progress.curriculum) - 1) + [1.0]
+    return CurriculumState(progress, stage_env, shares)
 
 
 def check_order(order: Order, progress: CurriculumProgress | None, weights: Weights, processes: int) -> None:

@@ -183,5 +183,5 @@ def rows_needed(hindsight: HindsightConfig, demonstrations: RunDemonstrations) -
     """Returns the largest number of rows that a run's demonstrations can fill, virtual rows included."""
     copies = sum(hindsight.sources.values()) * hindsight.refill if hindsight.algorithm.virtual else 0
     state = demonstrations.state
-    stages = len(state.curriculum) if state is not None and state.every_stage else 1
+    stages = 1 if state is None or state.stored_shares is None else len(state.stored_shares)
     return len(demonstrations.recorded.rows) * (1 + copies) * stages

@@ -84,6 +84,16 @@ def test_stages_with_goals_of_one_and_of_two_numbers_train_together() -> None:
     components.close()
 
 
+def test_a_small_share_of_the_episodes_trains_the_stages_below_the_last() -> None:
+    order = {"order": "all_at_once", "every_stage": True, "task_share": 1.0, "lower_share": 0.25}
+    components = build(small(task="hand_v1", algo="cher", **order))
+    run(components, progress=False)
+    rows = components.buffer[:]
+    reach, throw = rows["stage"][~rows["virtual"]].bincount(minlength=2).tolist()
+    assert 0.1 * throw < reach < 0.4 * throw
+    components.close()
+
+
 def test_a_goal_that_must_be_held_counts_at_the_end_of_its_stage_s_episodes() -> None:
     """All positions are near enough, so it is held from the first step on."""
     reach, throw = make_env("hand_v1").stages()

@@ -16,6 +16,8 @@ from torchrl_her import Curriculum, GoalReward, GoalWeights, HERWriter, StateToO
 from torchrl_her.curriculum import EpisodeStages, StageOutcomes, StageView, TeacherStudent, count_inputs
 from torchrl_her.modules import RunningNorm
 from torchrl_her.replay_buffers import RunsSampler, StageRule
+from torchrl_her.replay_buffers.episodes import Episodes
+from torchrl_her.replay_buffers.stage_rules import split_stages
 
 from ..her_data import make_batch, tag
 from .test_transforms import TinyEnv, make_three
@@ -266,6 +268,24 @@ def test_transitions_are_written_for_every_stage() -> None:
     assert stored["stage"][index].flatten().tolist() == [2] * 4
     assert stored["observation"][index][..., 0].tolist() == [[10.0, 11.0], [1010.0, 1012.0]]
     assert writer.counts.real == 12
+
+
+def test_a_share_of_the_episodes_is_written_for_another_stage() -> None:
+    generators = [torch.Generator().manual_seed(seed) for seed in (0, 1)]
+    rules = [StageRule(strict, view=lambda rows: rows, share=0.25), StageRule(strict, view=lambda rows: rows)]
+    played = [0] * 40 + [1] * 360  # in each of two runs
+    lengths, run = torch.full((800,), 2), torch.arange(2).repeat_interleave(400)
+    all_of_them = Episodes(torch.arange(1600).view(800, 2), lengths)
+    rows = TensorDict({"stage": torch.tensor(played * 2).repeat_interleave(2).unsqueeze(-1)}, [1600])
+    lower, upper = split_stages(rows, all_of_them, run, "stage", rules, generators)
+    assert torch.equal(upper[2].rows, all_of_them.rows)
+    for number in range(2):
+        mine = lower[2].rows[lower[3] == number, 0] // 2 - 400 * number
+        assert mine[:40].tolist() == list(range(40))  # those that were played in the stage
+        drawn = torch.rand(400, generator=torch.Generator().manual_seed(number)) < 0.25
+        assert mine[40:].tolist() == (drawn.nonzero().flatten()[drawn[:40].sum() :]).tolist()
+    with pytest.raises(ValueError, match=r"share of a StageRule must be in \[0, 1\], got 1.5"):
+        HERWriter(strict, stages=[StageRule(strict, share=1.5)])
 
 
 class OnlyLast(GoalWeights):

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 from torchrl_her_recipes.config.choices.kind import Choice, Kind
-from torchrl_her_recipes.config.options import option
+from torchrl_her_recipes.config.options import Needs, option
 
 _MAKERS = "torchrl_her_recipes.components.curricula"
 
@@ -17,9 +18,10 @@ class Order(Choice):
     The maker takes the options and the :class:`~torchrl_her.Curriculum`, and by keyword the number of
     ``runs`` and their random ``generators``. It returns a :class:`~torchrl_her.CurriculumProgress`, or an
     :class:`~torchrl_her.curriculum.EpisodeStages` if each episode has a stage of its own. An order may have
-    the options ``every_stage``, which stores each transition for every stage if episodes have stages,
-    ``relay``, with which the stages of the greedy policy act in turn, and ``stage_epsilon``, the epsilon with
-    which a run begins a stage (1 without this option).
+    the options ``every_stage``, which stores episodes for every stage if episodes have stages,
+    ``lower_share``, the share of them that it stores for stages below the last, ``relay``, with which the
+    stages of the greedy policy act in turn, and ``stage_epsilon``, the epsilon with which a run begins a
+    stage (1 without this option).
     """
 
 
@@ -42,8 +44,17 @@ class Threshold(Order):
 
 @dataclass(frozen=True, kw_only=True)
 class _ByEpisode(Order):
+    needs: ClassVar[Needs] = (("every_stage", bool, "lower_share"),)
+
     every_stage: bool = option(
         False, "whether each transition is stored for every stage, not just the stage of its episode"
+    )
+    lower_share: float = option(
+        1.0,
+        "share of the episodes that every_stage stores for the stages below the last, besides their own; "
+        "the smaller, the more of each batch trains the task itself",
+        at_least=0,
+        at_most=1,
     )
     relay: bool = option(
         False,
