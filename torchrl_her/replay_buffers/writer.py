@@ -18,7 +18,7 @@ from torchrl_her.checks import check_whole, entry_of
 from torchrl_her.files.state import StateFile
 from torchrl_her.goals.rewards import RewardFunction
 from torchrl_her.goals.weights import GoalWeights, WeightsOfRuns, weights_by_run
-from torchrl_her.randomness import check_generators
+from torchrl_her.randomness import Generators, check_generators
 from torchrl_her.replay_buffers.draw import draw_for_runs
 from torchrl_her.replay_buffers.episodes import find_episodes, time_order
 from torchrl_her.replay_buffers.keys import device_of, in_root_and_next
@@ -433,8 +433,7 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
         entries = max(1, min(_ROWS, self.capacity) // most), _ROWS // most
         episode_runs = None if run is None else run[episodes.rows[:, :1]].flatten()
         recent, settings, drafts, first_id = list(self._recent), self._settings(), [], self._episodes
-        generators = [self._rng] if self.generators is None else self.generators
-        parts = split_stages(rows, episodes, episode_runs, self._keys.stage, self.stages, generators)
+        parts = split_stages(rows, episodes, episode_runs, self._keys.stage, self.stages, self._sources())
         for stage, stage_rows, part, run_of in parts:
             recent_goals = recent[stage].after(
                 stage_rows, part, run_of, self._keys, sizes=self.options.remembered
@@ -448,6 +447,10 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
         self._commit(drafts, places)
         self._episodes = first_id
         return places.rows(self._rings.cursors, self.capacity)[held:], left, recent
+
+    def _sources(self) -> Generators:
+        """Returns each run's source of random numbers; a single run without one has the buffer's."""
+        return [self._rng] if self.generators is None else self.generators
 
     def _settings(self) -> list[Hashable]:
         """Returns the settings of each run; only runs with equal settings are written at once."""
@@ -468,7 +471,7 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
         source, goals, relabeled = draw_for_runs(
             chunk,
             weights=self._weights_of_runs() if weights and not weights[runs[0]].is_uniform else None,
-            generators=[self._rng] if self.generators is None else [self.generators[run] for run in runs],
+            generators=[self._sources()[run] for run in runs],
             recent=recent,
             times=self._times(runs[0]),
         )
