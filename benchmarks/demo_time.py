@@ -23,7 +23,7 @@ from machine import describe, publish, table
 
 import torchrl_her.trainers.trainer
 from torchrl_her_recipes import build, make_recipe, run
-from torchrl_her_recipes.config.shipped import load_preset
+from torchrl_her_recipes.config.presets import load_preset
 from torchrl_her_recipes.runs import run as run_module
 
 _IMPORTED = time.perf_counter()

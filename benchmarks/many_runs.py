@@ -30,7 +30,7 @@ def measure(runs: int, *, full: bool) -> dict[str, float]:
     import torch  # noqa: PLC0415  # after the process was put on one core
 
     from torchrl_her_recipes import build, make_recipe  # noqa: PLC0415
-    from torchrl_her_recipes.config.shipped import load_preset  # noqa: PLC0415
+    from torchrl_her_recipes.config.presets import load_preset  # noqa: PLC0415
 
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)

@@ -37,7 +37,7 @@ from torchrl.envs import EnvBase
 from torchrl_her import success
 from torchrl_her_recipes import Recipe, build, make_recipe
 from torchrl_her_recipes.components.envs import TaskEnvs, evaluation_envs, play_episodes
-from torchrl_her_recipes.config.shipped import load_preset
+from torchrl_her_recipes.config.presets import load_preset
 from torchrl_her_recipes.config.shortcuts import merge
 
 HAND = merge(load_preset("throwing"), {"task": "hand_v0", "algo": "her"})

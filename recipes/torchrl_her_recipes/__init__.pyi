@@ -20,13 +20,13 @@ from .config.loggers import LOGGERS as LOGGERS
 from .config.loggers import LoggerSpec as LoggerSpec
 from .config.loggers import register_logger as register_logger
 from .config.options import option as option
+from .config.presets import load_preset as load_preset
 from .config.recipe import Recipe as Recipe
 from .config.recipe import make_recipe as make_recipe
 from .config.searches.search import Search as Search
 from .config.searches.spaces import Space as Space
 from .config.searches.spaces import load_space as load_space
 from .config.searches.spaces import space_for as space_for
-from .config.shipped import load_preset as load_preset
 from .config.study import Study as Study
 from .config.study import load_study as load_study
 from .config.study import study_names as study_names

@@ -8,7 +8,7 @@ from torchrl_her_envs.registry import GYM, get_task_spec, task_names
 from torchrl_her_recipes.config.algorithms import ALGORITHMS
 from torchrl_her_recipes.config.policy_header import read_header
 from torchrl_her_recipes.config.searches.spaces import space_names, space_summary
-from torchrl_her_recipes.config.shipped import policy_files, preset_names, preset_summary
+from torchrl_her_recipes.config.shipped import PLURALS, file_summary, policy_files, shipped_names
 from torchrl_her_recipes.config.shortcuts import KINDS
 from torchrl_her_recipes.config.study import load_study, study_names
 
@@ -28,7 +28,10 @@ def listing() -> int:
             for name, path in policy_files().items()
         },
         "spaces": {name: space_summary(name) for name in space_names()},
-        "presets": {name: preset_summary(name) for name in preset_names()},
+        **{
+            PLURALS[kind]: {name: file_summary(kind, name) for name in shipped_names(kind)}
+            for kind in ("preset", "curriculum", "symmetry")
+        },
     }
     for title, entries in sections.items():
         click.echo(f"{title}:")

@@ -13,10 +13,10 @@ import torchrl_her_recipes as recipes  # imports torch only when one of its name
 from torchrl_her_recipes.cli.overrides import ARGUMENTS
 from torchrl_her_recipes.cli.say import FAILED, INTERRUPTED, fail
 from torchrl_her_recipes.cli.train_options import complete, folder_option, label, single, with_folder
+from torchrl_her_recipes.config.presets import load_preset
 from torchrl_her_recipes.config.recipe import make_recipe
 from torchrl_her_recipes.config.searches.search import PRUNERS, SAMPLERS, Search
 from torchrl_her_recipes.config.searches.spaces import load_space, space_for, space_names
-from torchrl_her_recipes.config.shipped import load_preset
 from torchrl_her_recipes.config.shortcuts import merge
 
 if TYPE_CHECKING:

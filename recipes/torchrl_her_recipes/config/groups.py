@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, ClassVar
 
 from torchrl_her_envs.registry import check_options as check_task_options
@@ -13,6 +12,7 @@ from torchrl_her_recipes.config.algorithms import Algorithm, check_goal_sources,
 from torchrl_her_recipes.config.loggers import check_loggers
 from torchrl_her_recipes.config.options import AUTO, Needs, check_options, option
 from torchrl_her_recipes.config.plain_files import read_yaml
+from torchrl_her_recipes.config.shipped import find_file
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,13 +155,15 @@ class ReplayConfig(Group):
     batch_size: int = option(256, "number of transitions in a gradient step", at_least=1)
     batches_per_sample: int = option(32, "number of batches that one call of the sampler draws", at_least=1)
     symmetry: Any = option(
-        None, "YAML file, or mapping, of mirror images and shifts of the task, drawn anew in each batch"
+        None,
+        "mirror images and shifts of the task, drawn anew in each batch: a name of `torchrl-her list`, a "
+        "YAML file or a mapping",
     )
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if isinstance(self.symmetry, str):  # read at once: a saved recipe must not need the file
-            object.__setattr__(self, "symmetry", _read(Path(self.symmetry), "symmetry must be a YAML file"))
+            object.__setattr__(self, "symmetry", read_yaml(find_file("symmetry", self.symmetry)))
         if self.symmetry is not None and not isinstance(self.symmetry, Mapping):
             raise ValueError(f"symmetry must be a mapping, got {self.symmetry!r}")
         if self.batch_size > self.buffer_size:
@@ -233,7 +235,8 @@ class CurriculumConfig(Group):
 
     name: str = option(
         "task",
-        "task, for the stages that the task itself defines, or a YAML file with a list of stages",
+        "task, for the stages that the task itself defines, a name of `torchrl-her list`, or a YAML file "
+        "with a list of stages",
         shown_as="curriculum",
     )
     stages: Any = option(None, "the list of stages, each a mapping of its options, in place of a file")
@@ -257,8 +260,7 @@ class CurriculumConfig(Group):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.name != "task" and self.stages is None:  # read at once: a saved recipe must not need the file
-            must = "curriculum must be 'task' or a YAML file with a list of stages"
-            object.__setattr__(self, "stages", _read(Path(self.name), must))
+            object.__setattr__(self, "stages", read_yaml(find_file("curriculum", self.name, "task")))
         stages = self.stages
         if stages is not None and not (
             isinstance(stages, list | tuple)
@@ -268,12 +270,6 @@ class CurriculumConfig(Group):
             raise ValueError(
                 f"a curriculum must be a list of stages, each with its options by name, got {stages!r}"
             )
-
-
-def _read(path: Path, must: str) -> Any:
-    if not path.is_file():
-        raise ValueError(f"{must}, got {str(path)!r}")
-    return read_yaml(path)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,8 +11,9 @@ from typing import Any
 from torchrl_her_recipes.config.imports import permit_task
 from torchrl_her_recipes.config.metrics import AXES
 from torchrl_her_recipes.config.plain_files import naming, read_mapping
+from torchrl_her_recipes.config.presets import load_preset
 from torchrl_her_recipes.config.recipe import Recipe, compose
-from torchrl_her_recipes.config.shipped import find_file, load_preset, shipped_names
+from torchrl_her_recipes.config.shipped import find_file, shipped_names
 from torchrl_her_recipes.config.shortcuts import locate, merge, place
 
 _LENGTHS = ("num_runs", "epochs", "epoch_frames", "frames")

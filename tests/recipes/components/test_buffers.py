@@ -89,10 +89,11 @@ def test_sampled_transitions_are_shifted_in_the_stage_of_each(order: str | None)
 @pytest.mark.parametrize(
     ("symmetry", "message"),
     [
-        ("nowhere.yaml", "symmetry must be a YAML file, got 'nowhere.yaml'"),
+        ("nowhere.yaml", "there is no symmetry 'nowhere.yaml'; the symmetries are fetch"),
         ([1], r"symmetry must be a mapping, got \[1\]"),
         ({"mirrors": {0: 0.0}}, "is no symmetry: .*unexpected keyword argument 'mirrors'"),
         ({"shifts": [{"columns": [0]}]}, "is no symmetry: .*missing .* 'most'"),
+        ("fetch", "the state has the columns 0 to .*, but the symmetry has"),
         ({"mirror": {99: 0.0}}, "the state has the columns 0 to .*, but the symmetry has 99"),
     ],
 )

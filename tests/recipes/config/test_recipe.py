@@ -17,7 +17,7 @@ from torchrl_her.native import load_steps
 from torchrl_her.replay_buffers import RunsPrioritizedSampler, RunsSampler
 from torchrl_her_recipes import ALGORITHMS, Recipe, build, make_recipe, run
 from torchrl_her_recipes.components.assembly import make_collector
-from torchrl_her_recipes.config.shipped import load_preset
+from torchrl_her_recipes.config.presets import load_preset
 
 from ..small import small
 
@@ -38,7 +38,7 @@ from ..small import small
         ({"goal_sources": "actual"}, r"must be numbers of goals by source, as in .*, got 'actual'"),
         ({"goal_sources": {}}, r"must be numbers of goals by source, .*, got \{\}"),
         ({"goal_sources": {"actual:2": None}}, "goal_sources needs a space behind each colon, as in "),
-        ({"curriculum": "nowhere.yaml"}, "curriculum must be 'task' or a YAML file with a list of stages"),
+        ({"curriculum": "nowhere.yaml"}, "there is no curriculum 'nowhere.yaml'; the curricula are task, "),
         ({"sampler": "best"}, "sampler must be one of prioritized, uniform, got 'best'"),
         ({"threshold": -0.1}, "threshold must be above 0, got -0.1"),
         ({"batch_size": 256, "buffer_size": 100}, "batch_size=256 must be at most buffer_size=100"),

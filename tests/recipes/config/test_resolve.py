@@ -10,7 +10,7 @@ import yaml
 from torchrl_her_recipes import build, load_preset, make_recipe, run
 from torchrl_her_recipes.config.choices.order import AllAtOnce, Threshold
 from torchrl_her_recipes.config.resolve import EnvFacts, auto_options, resolve
-from torchrl_her_recipes.config.shipped import preset_names
+from torchrl_her_recipes.config.shipped import shipped_names
 
 
 @pytest.mark.parametrize(
@@ -77,7 +77,7 @@ def test_a_run_of_few_frames_is_one_short_epoch() -> None:
     assert recipe.total_frames == recipe.collection.num_envs * recipe.collection.steps_per_batch
 
 
-@pytest.mark.parametrize("preset", preset_names())
+@pytest.mark.parametrize("preset", shipped_names("preset"))
 def test_presets_leave_nothing_to_the_environment(preset: str) -> None:
     assert auto_options(make_recipe(load_preset(preset))) == []
 

@@ -7,12 +7,13 @@ from pathlib import Path
 import pytest
 
 from torchrl_her_recipes import load_preset, make_recipe
+from torchrl_her_recipes.config.plain_files import read_yaml
 from torchrl_her_recipes.config.resolve import auto_options
-from torchrl_her_recipes.config.shipped import preset_names, preset_summary
+from torchrl_her_recipes.config.shipped import file_summary, find_file, shipped_names
 from torchrl_her_recipes.config.study import load_study, study_names
 
 
-@pytest.mark.parametrize("name", preset_names())
+@pytest.mark.parametrize("name", shipped_names("preset"))
 def test_every_preset_makes_a_recipe_and_says_what_it_is_for(name: str) -> None:
     values = load_preset(name)
     recipe = make_recipe(values).to_dict()
@@ -21,8 +22,9 @@ def test_every_preset_makes_a_recipe_and_says_what_it_is_for(name: str) -> None:
         made = (
             with_ibs if group in ("weights", "behavior") else recipe
         )  # options of IBS are dropped without it
-        assert own == {key: made[group][key] for key in own}
-    assert 10 < len(preset_summary(name)) < 90
+        read = {key: read_yaml(find_file(key, value)) for key, value in own.items() if key == "symmetry"}
+        assert own | read == {key: made[group][key] for key in own}
+    assert 10 < len(file_summary("preset", name)) < 90
 
 
 # The defaults before there were any for unknown environments; shipped presets and studies build on them.
@@ -48,7 +50,7 @@ THROWING = {
 
 def test_numbers_of_shipped_presets_and_studies_do_not_follow_the_defaults() -> None:
     assert load_preset("throwing") == THROWING
-    for name in preset_names():
+    for name in shipped_names("preset"):
         values = load_preset(name)
         for group, own in THROWING.items():
             assert own.keys() <= values[group].keys(), name
@@ -62,7 +64,7 @@ def test_a_file_of_ones_own(tmp_path: Path) -> None:
     file = tmp_path / "own.yaml"
     file.write_text("seed: 3\ntask: {name: hand_v1}\n")
     assert make_recipe(load_preset(str(file))).run.seed == 3
-    assert preset_summary(str(file)) == ""
+    assert file_summary("preset", str(file)) == ""
     with pytest.raises(ValueError, match="there is no preset 'demoo'; did you mean demo. The presets are"):
         load_preset("demoo")
 

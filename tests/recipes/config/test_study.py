@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from torchrl_her_recipes import Study, load_study, study_names
+from torchrl_her_recipes import Study, load_preset, load_study, study_names
 from torchrl_her_recipes.config import imports
 from torchrl_her_recipes.config.imports import check_permitted
 from torchrl_her_recipes.config.study import curve_label
@@ -153,12 +154,20 @@ def test_mistakes_are_named(values: dict[str, object], message: str) -> None:
         list(Study(name="own", **values).cells())  # type: ignore[arg-type]
 
 
-def test_studies_of_this_package_may_name_modules(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("load", "name", "task"),
+    [
+        (load_study, "defaults", "gym:panda_gym:PandaReach-v3"),
+        (load_preset, "panda_stack", "gym:panda_gym:PandaStack-v3"),
+    ],
+)
+def test_files_of_this_package_may_name_modules(
+    monkeypatch: pytest.MonkeyPatch, load: Callable[[str], object], name: str, task: str
+) -> None:
     monkeypatch.setattr(imports, "_permitted", set())
-    task = "gym:panda_gym:PandaReach-v3"
     with pytest.raises(ValueError, match="would import the module 'panda_gym'"):
         check_permitted(task)
-    load_study("defaults")
+    load(name)
     check_permitted(task)
 
 

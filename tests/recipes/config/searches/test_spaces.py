@@ -9,7 +9,7 @@ import pytest
 from torchrl_her_recipes import LEARNERS, Search, load_preset, load_space, make_recipe, space_for
 from torchrl_her_recipes.config.groups import HindsightConfig
 from torchrl_her_recipes.config.searches.spaces import Space, space_names
-from torchrl_her_recipes.config.shipped import preset_names
+from torchrl_her_recipes.config.shipped import shipped_names
 
 
 @pytest.mark.parametrize("learner", sorted(LEARNERS.keys() - {"auto"}))
@@ -36,7 +36,7 @@ def test_there_are_no_other_spaces() -> None:
     assert set(space_names()) == LEARNERS.keys() - {"auto"}
 
 
-@pytest.mark.parametrize("preset", preset_names())
+@pytest.mark.parametrize("preset", shipped_names("preset"))
 def test_every_preset_can_be_searched_around(preset: str) -> None:
     recipe = make_recipe(load_preset(preset))
     assert len(Search(recipe=recipe, space=space_for(recipe)).space.ranges) > 8
