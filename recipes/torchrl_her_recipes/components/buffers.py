@@ -16,7 +16,6 @@ from torchrl.data.replay_buffers.scheduler import LinearScheduler
 from torchrl.envs import DeviceCastTransform, EnvBase
 
 from torchrl_her.curriculum.normalization import count_inputs
-from torchrl_her.curriculum.switch import set_stage_goals
 from torchrl_her.curriculum.transforms import ZeroPad
 from torchrl_her.curriculum.view import StageView
 from torchrl_her.env_keys import PROPOSED, PROPOSED_REACHED
@@ -103,9 +102,7 @@ def make_buffer(
     if devices.learner != devices.replay:
         buffer.append_transform(DeviceCastTransform(devices.learner, orig_device=devices.replay))
     if state is not None:
-        if not state.progress.by_episode:
-            for run in range(runs):
-                set_stage_goals(buffer.writer, state.progress.stage_of(run), run=run)
+        state.set_goals(buffer.writer)
         buffer.append_transform(ZeroPad(state.curriculum, state.progress))
     if recipe.replay.symmetry is not None:
         buffer.append_transform(_make_augmentation(recipe.replay.symmetry, task, state, generators))

@@ -6,11 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from torchrl.data import Writer
 from torchrl.envs import CatTensors, Compose, EnvBase, InitTracker, Transform, TransformedEnv
 
 from torchrl_her.behavior import BehaviorGoals
 from torchrl_her.curriculum.orders import EpisodeStages, TeacherStudent
 from torchrl_her.curriculum.stages import Curriculum, CurriculumProgress, CurriculumStage
+from torchrl_her.curriculum.switch import set_stage_goals
 from torchrl_her.curriculum.transforms import StageOutcomes, StateToObs, ZeroPad
 from torchrl_her.demonstrations.starts import DemonstrationStarts
 from torchrl_her_envs.common.goal_env import GoalEnv, goal_env, reward_range
@@ -48,6 +50,14 @@ class CurriculumState:
     def at_the_top(self, run: int) -> bool:
         """Returns whether a run is in the last stage, which is the full task."""
         return self.progress.stages[run] == len(self.curriculum) - 1
+
+    def set_goals(self, writer: Writer) -> None:
+        """Sets the reward function and weights of a writer to those of each run's stage.
+
+        If each episode has a stage of its own, the writer has rules for all stages, and nothing is set.
+        """
+        for run in range(0 if self.progress.by_episode else self.progress.runs):
+            set_stage_goals(writer, self.progress.stage_of(run), run=run)
 
 
 def make_curriculum(options: CurriculumConfig | None, env: EnvBase) -> Curriculum | None:

@@ -10,7 +10,7 @@ import torch
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs import EnvBase
 
-from torchrl_her.curriculum.switch import enter_stage, set_stage_goals
+from torchrl_her.curriculum.switch import enter_stage
 from torchrl_her.demonstrations.dataset import Demonstrations
 from torchrl_her.demonstrations.replay import MixedReplay, write_demonstrations
 from torchrl_her.demonstrations.shown import in_stage, with_reward
@@ -84,10 +84,10 @@ class RunDemonstrations:
             load_buffer_state_dict(self.buffer, state["buffer"])
         if self.state is None:
             return
-        for run in range(self.state.progress.runs):
-            if self.buffer is not None:
-                set_stage_goals(self.buffer.writer, self.state.progress.stage_of(run), run=run)
-            if self.starts is not None:
+        if self.buffer is not None:
+            self.state.set_goals(self.buffer.writer)
+        if self.starts is not None:
+            for run in range(self.state.progress.runs):
                 self.starts.show(self.shown(run), run=run)
 
 

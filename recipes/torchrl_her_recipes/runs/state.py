@@ -10,7 +10,6 @@ from typing import Any
 import torch
 from torchrl.envs import EnvBase
 
-from torchrl_her.curriculum.switch import set_stage_goals
 from torchrl_her.goals.strategies import sources_name, strategy_name
 from torchrl_her.modules.noise import generator_states, set_generator_states
 from torchrl_her.replay_buffers.writer import HERWriter
@@ -56,8 +55,7 @@ def parts_of(components: Components, trainer: Trainer) -> dict[str, Any]:
     def load_progress(progress: dict[str, Any]) -> None:
         assert state is not None
         state.progress.load_state_dict(progress)
-        for run in range(0 if state.progress.by_episode else state.progress.runs):
-            set_stage_goals(buffer.writer, state.progress.stage_of(run), run=run)
+        state.set_goals(buffer.writer)
 
     def begin_episodes(_state: dict[str, Any]) -> None:
         if trainer.in_epoch:  # new episodes begin, since the environments' states are not saved

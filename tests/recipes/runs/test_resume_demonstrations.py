@@ -40,6 +40,7 @@ def asked(file: str, **options: Any) -> dict[str, Any]:
             id="two runs, with starts",
         ),
         pytest.param({"sampler": "uniform", "learner": "sac"}, id="sac"),
+        pytest.param({"algo": "cher", "order": "all_at_once", "every_stage": True}, id="all stages at once"),
     ],
 )
 def test_a_stop_changes_nothing(options: dict[str, Any], file: str, tmp_path: Path) -> None:
