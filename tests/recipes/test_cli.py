@@ -12,8 +12,9 @@ import yaml
 
 import torchrl_her_recipes
 from torchrl_her_recipes import ALGORITHMS, cli
+from torchrl_her_recipes.config.plain_files import read_yaml
 from torchrl_her_recipes.config.presets import load_preset
-from torchrl_her_recipes.config.shipped import CONF
+from torchrl_her_recipes.config.shipped import CONF, find_file
 
 from .small import Refused, overrides
 from .studies.forked_worker import fork_workers
@@ -92,10 +93,10 @@ def test_every_preset_runs(preset: Path) -> None:
     config = yaml.safe_load(Path("out/config.yaml").read_text())
     for group, own in load_preset(preset.stem).items():
         for name, value in own.items():
-            # a floor is for goals that have weights; a symmetry is named, and stored as it is read
-            dropped = name in ("floor_is_relative", "symmetry")
+            dropped = name == "floor_is_relative"  # for goals that have no such weights
             if not dropped and f"{name}=" not in " ".join([*shrunk, "num_runs="]):
-                assert config[group][name] == value
+                stored = read_yaml(find_file(name, value)) if name == "symmetry" else value
+                assert config[group][name] == stored
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from torchrl_her_envs.registry import GYM, get_task_spec, task_names
 from torchrl_her_recipes.config.algorithms import ALGORITHMS
 from torchrl_her_recipes.config.policy_header import read_header
 from torchrl_her_recipes.config.searches.spaces import space_names, space_summary
-from torchrl_her_recipes.config.shipped import PLURALS, file_summary, policy_files, shipped_names
+from torchrl_her_recipes.config.shipped import PLURALS, file_summary, files_of_options, policy_files
 from torchrl_her_recipes.config.shortcuts import KINDS
 from torchrl_her_recipes.config.study import load_study, study_names
 
@@ -29,8 +29,8 @@ def listing() -> int:
         },
         "spaces": {name: space_summary(name) for name in space_names()},
         **{
-            PLURALS[kind]: {name: file_summary(kind, name) for name in shipped_names(kind)}
-            for kind in ("preset", "curriculum", "symmetry")
+            PLURALS[kind]: {name: file_summary(kind, name) for name in names}
+            for kind, names in files_of_options().items()
         },
     }
     for title, entries in sections.items():

@@ -9,7 +9,7 @@ from typing import Any
 from torchrl_her_envs.registry import task_names
 from torchrl_her_recipes.config.algorithms import ALGORITHMS
 from torchrl_her_recipes.config.plain_files import parse_yaml
-from torchrl_her_recipes.config.shipped import shipped_names
+from torchrl_her_recipes.config.shipped import files_of_options
 from torchrl_her_recipes.config.shortcuts import GROUPS, KINDS, locate, split_name
 
 ARGUMENTS = ("preset", "folder")  # arguments that are not options; their values are never parsed as YAML
@@ -67,7 +67,7 @@ def _meant(text: str) -> str:
         ("task", task_names()),
         ("algo", ALGORITHMS),
         *KINDS.items(),
-        *((kind, shipped_names(kind)) for kind in ("preset", "curriculum", "symmetry")),
+        *files_of_options().items(),
     ):
         if text in known:
             return f"; did you mean {name}={text}?"

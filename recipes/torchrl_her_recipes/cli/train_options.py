@@ -26,7 +26,7 @@ from torchrl_her_recipes.config.options import AUTO
 from torchrl_her_recipes.config.plain_files import naming
 from torchrl_her_recipes.config.presets import load_preset
 from torchrl_her_recipes.config.recipe import Recipe, make_recipe
-from torchrl_her_recipes.config.shipped import shipped_names
+from torchrl_her_recipes.config.shipped import files_of_options, shipped_names
 from torchrl_her_recipes.config.shortcuts import GROUPS, KINDS, LONG_ONLY, choices_of, option_names
 
 folder_option = click.option("--folder", metavar="DIR", help="output folder")
@@ -95,11 +95,10 @@ class OptionsCommand(click.Command):
     """A command whose help lists the options of a recipe, group by group."""
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        presets = ", ".join(shipped_names("preset"))
-        preset = f"start from the values of a preset: {presets}, or a YAML file"
+        presets = f"start from the values of a preset: {', '.join(shipped_names('preset'))}, or a YAML file"
         folder = "folder of the run (default: a new one in runs/)"
         with formatter.section("Besides options"):
-            formatter.write_dl([("preset=NAME", preset), ("folder=DIR", folder)])
+            formatter.write_dl([("preset=NAME", presets), ("folder=DIR", folder)])
         for group, kind in GROUPS.items():
             doc = (kind.__doc__ or "").splitlines()[0].rstrip(".")
             with formatter.section(f"{group}: {doc[0].lower()}{doc[1:]}"):
@@ -157,6 +156,6 @@ def _values() -> dict[str, list[str]]:
     return {**choices, **{group: list(kind) for group, kind in KINDS.items()}} | {
         "task": task_names(),
         "algo": list(ALGORITHMS),
-        **{kind: shipped_names(kind) for kind in ("preset", "curriculum", "symmetry")},
+        **files_of_options(),
         "strategy": list(STRATEGIES),
     }

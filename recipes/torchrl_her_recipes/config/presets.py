@@ -7,7 +7,7 @@ from typing import Any
 
 from torchrl_her_recipes.config.imports import permit_task
 from torchrl_her_recipes.config.plain_files import naming, read_mapping
-from torchrl_her_recipes.config.shipped import CONF, find_file
+from torchrl_her_recipes.config.shipped import find_file, shipped_names
 from torchrl_her_recipes.config.shortcuts import merge, place
 
 
@@ -36,6 +36,6 @@ def _load(name: str, above: tuple[Path, ...]) -> dict[str, Any]:
         task = place(values).get("task", {}).get("name", "")  # raises if a name is unknown
         if first is not None:
             find_file("preset", first)
-    if path.parent == CONF / "preset":
+    if name in shipped_names("preset"):
         permit_task(task)  # presets of the package are trusted, so the modules of their tasks are, too
     return values if first is None else merge(_load(first, (*above, path)), values)

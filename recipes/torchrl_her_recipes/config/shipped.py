@@ -11,7 +11,6 @@ from torchrl_her_recipes.config.policy_header import POLICY_SUFFIX, read_header
 CONF = Path(__file__).parent.parent / "conf"
 _TRAINED = Path(__file__).parent.parent / "trained"
 
-
 # what comes with the package as YAML files, each kind in a folder of its own, and the plural of its name
 PLURALS = {
     "preset": "presets",
@@ -29,6 +28,11 @@ def shipped_names(kind: str) -> list[str]:
         kind: ``preset``, ``space``, ``study``, ``curriculum`` or ``symmetry``.
     """
     return sorted(path.stem for path in (CONF / kind).glob("*.yaml"))
+
+
+def files_of_options() -> dict[str, list[str]]:
+    """Returns the names of the files that options can be set to, by option: presets, curricula and so on."""
+    return {kind: shipped_names(kind) for kind in ("preset", "curriculum", "symmetry")}
 
 
 def find_file(kind: str, name: str, *others: str) -> Path:
