@@ -62,18 +62,15 @@ def choices_of(group: str) -> dict[str, type[groups.Group]]:
     return {kind.default: kind[kind.default], **kind} if isinstance(kind, Kind) else {"": kind}
 
 
-def option_names() -> dict[str, list[str]]:
+def option_names() -> dict[str, tuple[str, ...]]:
     """Returns the names of the options of each group; in a group with choices, those of all its choices."""
-    names = {group: ["name"] if group in KINDS else [] for group in GROUPS}
-    for group, known in names.items():
-        kinds = choices_of(group).values()
-        known += dict.fromkeys(name for kind in kinds for name in _field_names(kind))  # type: ignore[arg-type]
-    return names
+    return {group: _names(group in KINDS, *choices_of(group).values()) for group in GROUPS}  # type: ignore[arg-type]
 
 
 @cache
-def _field_names(kind: type[groups.Group]) -> list[str]:
-    return [option.name for option in fields(kind)]
+def _names(choice: bool, *kinds: type[groups.Group]) -> tuple[str, ...]:
+    known = [option.name for kind in kinds for option in fields(kind)]
+    return tuple(dict.fromkeys(["name", *known] if choice else known))
 
 
 def chosen(group: str, *values: Nested) -> str:
@@ -95,11 +92,12 @@ def renamed(name: str) -> list[str]:
         >>> renamed("learner.average_decay")
         ['learner.ema_decay']
     """
-    names, (group, dot, key) = option_names(), str(name).partition(".")
+    group, dot, key = str(name).partition(".")
     if now := FORMER_NAMES.get(key or group):
         return [group + dot + now if key else now]
-    homes = [] if key in names.get(group, ()) else FORMER.get(group, ())
-    return [home if key == home else f"{home}.{key}" for home in homes if key in (home, *names[home])]
+    if group not in FORMER or key in (names := option_names()).get(group, ()):
+        return []
+    return [home if key == home else f"{home}.{key}" for home in FORMER[group] if key in (home, *names[home])]
 
 
 def locate(name: str, *values: Nested) -> tuple[str, str]:

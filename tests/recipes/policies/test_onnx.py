@@ -33,7 +33,6 @@ def played(path: Path, seen: TensorDictBase) -> np.ndarray:
     "options",
     [
         *LEARNERS,
-        {"learner": "ddpg", "normalize": True},
         {"learner": "sac", "dtype": "float64", "scale": 3.0},
         {"learner": "td3", "normalize": True, "relay": True},
     ],

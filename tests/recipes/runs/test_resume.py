@@ -141,15 +141,10 @@ def test_a_run_that_is_killed_at_any_moment_ends_bit_for_bit_as_one_that_was_not
         ),
         pytest.param({**ALL, "normalize": True}, id="normalized in a curriculum"),
         pytest.param(
-            {"task": "hand_v1", "num_runs": 2, "normalize": True, "priority_beta_end": 1.0}, id="normalized"
-        ),
-        pytest.param(
-            {"task": "hand_v1", "num_runs": 2, "goal_sources": {"future": 1, "actual": 2, "achieved": 2}},
-            id="goals of other episodes",
-        ),
-        pytest.param(
-            {"task": "hand_v1", "num_runs": 2, "symmetry": {"mirror": {0: 0.0}, "mirror_action": [0]}},
-            id="mirror images",
+            {"task": "hand_v1", "num_runs": 2, "normalize": True, "priority_beta_end": 1.0}
+            | {"goal_sources": {"future": 1, "actual": 2, "achieved": 2}}
+            | {"symmetry": {"mirror": {0: 0.0}, "mirror_action": [0]}},
+            id="normalized, with goals of other episodes and mirror images",
         ),
         pytest.param({"sampler": "uniform", "hard_update_interval": 7, "norm": "batch"}, id="hard updates"),
         pytest.param(
