@@ -98,15 +98,18 @@ class PenalizedSACLoss(SACLoss):
     @torch.no_grad()
     def _compute_target_v2(self, tensordict: TensorDictBase) -> Tensor:
         tensordict = tensordict.clone(False)
-        after = tensordict.get("next").copy()
+        values, entropy = self._target_values(tensordict.get("next").copy())
+        value = least_of_some(values, self.target_critics, self.noise) + entropy
+        tensordict.set(("next", self.value_estimator.tensor_keys.value), value)
+        return self.value_estimator.value_estimate(tensordict).squeeze(-1)
+
+    def _target_values(self, after: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """Draws actions; returns their values by N target critics [N, ..., M], and their entropy [..., 1]."""
         action, log_prob = self._draw(after)
         after.set(self.tensor_keys.action, action)
         valued = self._vmap_qnetworkN0(after, self.target_qvalue_network_params)
-        values = valued.get(self.tensor_keys.state_action_value)
-        value = least_of_some(values, self.target_critics, self.noise)
-        value = value - (self._by_run(self._alpha, log_prob) * log_prob).unsqueeze(-1)
-        tensordict.set(("next", self.value_estimator.tensor_keys.value), value)
-        return self.value_estimator.value_estimate(tensordict).squeeze(-1)
+        entropy = -(self._by_run(self._alpha, log_prob) * log_prob).unsqueeze(-1)
+        return valued.get(self.tensor_keys.state_action_value), entropy
 
     def _alpha_loss(self, log_prob: Tensor) -> Tensor:
         return -self._by_run(self.log_alpha, log_prob) * (log_prob + self.target_entropy)

@@ -51,13 +51,9 @@ class PenalizedTQCLoss(PenalizedSACLoss, TQCLoss):
     @torch.no_grad()
     def compute_target(self, tensordict: TensorDictBase) -> Tensor:
         """Computes the targets [..., K]: the least K quantiles of all critics together."""
-        after = tensordict.get("next").copy()
-        action, log_prob = self._draw(after)
-        after.set(self.tensor_keys.action, action)
-        valued = self._vmap_qnetworkN0(after, self.target_qvalue_network_params)
-        every = valued.get(self.tensor_keys.state_action_value).movedim(0, -2).flatten(-2)
+        values, entropy = self._target_values(tensordict.get("next").copy())
+        every = values.movedim(0, -2).flatten(-2)
         kept = every.shape[-1] - self.top_quantiles_to_drop_per_net * self.num_qvalue_nets
-        entropy = -(self._by_run(self._alpha, log_prob) * log_prob).unsqueeze(-1)
         value = every.sort(-1).values[..., :kept] + entropy
         keys, steps_key = self.tensor_keys, self.value_estimator.tensor_keys.steps_to_next_obs
         entries = [("next", key) for key in (keys.reward, keys.done, keys.terminated)]
