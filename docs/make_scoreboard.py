@@ -112,7 +112,7 @@ def boards() -> dict[str, list[Curves]]:
             theirs("DDPG+HER", "FetchPickAndPlace", "DDPG and HER, by Relay-HER's authors"),
         ],
         "FetchSlide": [
-            ours("TD3 of FetchSlide's stages and symmetries", "`preset=fetch_slide`, seeds 0 and 100"),
+            ours("TD3 of FetchSlide's stages and symmetries", "`preset=fetch_slide`, seeds 0, 100 and 101"),
             ours("default agent on FetchSlide", "default agent, `epsilon_decay=0.99`"),
         ],
         "PandaPush": defaults("PandaPush"),
