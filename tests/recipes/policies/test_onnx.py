@@ -33,6 +33,7 @@ def played(path: Path, seen: TensorDictBase) -> np.ndarray:
     "options",
     [
         *LEARNERS,
+        {"learner": "ddpg", "normalize": True},
         {"learner": "sac", "dtype": "float64", "scale": 3.0},
         {"learner": "td3", "normalize": True, "relay": True},
     ],

@@ -81,6 +81,7 @@ LATER: dict[str, Any] = {
     "seed": 5,
 }
 LEARNERS: list[dict[str, Any]] = [
+    {"learner": "ddpg"},
     {"learner": "td3"},
     {"learner": "sac"},
     {"learner": "redq", "critics": 3},
@@ -148,7 +149,7 @@ def test_a_run_with_discrete_actions_that_learns_later_is_what_it_is_alone() -> 
     check_like_alone({**LATER, "task": "bit_flip", "task.options.bits": 12}, tolerance=1e-4)
 
 
-@pytest.mark.parametrize(("learner", "seed"), [("ddpg", 7), pytest.param("sac", 15, marks=pytest.mark.full)])
+@pytest.mark.parametrize(("learner", "seed"), [("ddpg", 7), ("sac", 15)])
 def test_runs_in_different_stages_of_a_curriculum_are_what_they_are_alone(learner: str, seed: int) -> None:
     """The first run reaches the second stage after an epoch."""
     options = {"algo": "cher", "task": "hand_v1", "learner": learner, "seed": seed, "dtype": "float64"}
