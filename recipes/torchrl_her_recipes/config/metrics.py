@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-PANELS = (
-    ("success", "success rate", (-0.02, 1.02)),
-    ("distance", "distance to goal at the end", None),
-    ("q_bias", "Q of the start minus return", None),
-    ("loss_value", "loss of the critic", None),
-    ("rows_real_positive", "positive rewards, real rows", None),
-    ("rows_useful_virtual_positive", "positive rewards, virtual rows that count", None),
-)
-AXES = {name: (label, limits) for name, label, limits in PANELS} | {
+AXES = {
+    "success": ("success rate", (-0.02, 1.02)),
+    "distance": ("distance to goal at the end", None),
+    "q_bias": ("Q of the start minus return", None),
+    "loss_value": ("loss of the critic", None),
+    "rows_real_positive": ("positive rewards, real rows", None),
+    "rows_useful_virtual_positive": ("positive rewards, virtual rows that count", None),
     "reached": ("goal reached at some step", (-0.02, 1.02)),
     "q": ("Q of the start", None),
     "rows_virtual_positive": ("positive rewards, virtual rows", None),

@@ -81,7 +81,6 @@ def _curve(
             axes.plot(frames, middle, color=palette[label], linestyle="--", linewidth=1.2)
         handles += [Line2D([], [], color=_INK, linestyle="--", label="return")]
     axes.set_xlabel("environment steps of each run")
-    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     if name.startswith("rows_"):
         axes.yaxis.set_major_formatter(EngFormatter(sep=""))
     figure.legend(handles=handles, loc="outside lower center", ncols=2, frameon=False)

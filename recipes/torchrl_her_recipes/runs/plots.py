@@ -15,7 +15,7 @@ from matplotlib.ticker import EngFormatter, MaxNLocator
 
 from torchrl_her.files.writing import written
 from torchrl_her_envs.common.goal_env import Box, GoalEnv
-from torchrl_her_recipes.config.metrics import AXES, PANELS
+from torchrl_her_recipes.config.metrics import AXES
 from torchrl_her_recipes.runs.goal_map import GoalMap
 
 Rows = Sequence[dict[str, float]]
@@ -32,6 +32,7 @@ COLORS = {  # color of each algorithm in all pictures; other labels use the rema
     "cher_ibs": "#0bc5ea",
     "unfiltered_cher_ibs": "#975a16",
 }
+_PANELS = tuple(AXES)[:6]  # metrics that are drawn for each run
 _REGIONS = {"goals": "#63b3ed", "reach": "#fc8181"}
 _MOST_LINES = 15  # largest number of runs for which each run has a line of its own
 _MOST_COLUMNS = 6  # largest number of panels side by side
@@ -42,23 +43,21 @@ def plot_curves(rows: Rows, path: Path, *, title: str = "") -> None:
     """Draws the main metrics over environment steps; for several runs, with median and percentiles."""
     figure = Figure(figsize=(14, 6), layout="constrained")
     figure.suptitle(title)
-    for axes, (name, label, limits) in zip(figure.subplots(2, 3).flat, PANELS, strict=True):
+    changes = stage_changes(rows)
+    for axes, name in zip(figure.subplots(2, 3).flat, _PANELS, strict=True):
         if all(name in row for row in rows):
             draw_curve(axes, rows, name)
         if name == "success" and any(row.get("reached", row[name]) != row[name] for row in rows):
             frames, _, middle, _ = band(rows, "reached")
             axes.plot(frames, middle, "--", color="#dd6b20", label="reached at some step")
             axes.legend(fontsize=8)
-        for change in stage_changes(rows):
+        for change in changes:
             axes.axvline(change, color="#a0aec0", linewidth=0.8, linestyle=":")
-        axes.set(xlabel="environment steps", ylabel=label)
-        count_frames(axes)
-        axes.grid(alpha=0.3)
-        if limits is not None:
-            axes.set_ylim(*limits)
+        axes.set_xlabel("environment steps")
+        _set_up(axes, name)
     several = len({row["run"] for row in rows}) > 1
     legend = ["line: median, band: 33rd to 67th percentile, thin lines: single runs"] if several else []
-    legend += ["dotted: a run enters the next stage"] if stage_changes(rows) else []
+    legend += ["dotted: a run enters the next stage"] if changes else []
     figure.supxlabel("; ".join(legend), fontsize=9)
     save_figure(figure, path)
 
@@ -80,19 +79,18 @@ def plot_comparison(
         metrics: metrics to draw. With several of them and several titles, each metric has a row of panels.
     """
     columns = [(title, curves, name) for name in metrics for title, curves in panels.items()]
-    rows = len(metrics) if len(panels) > 1 else 1
+    one_metric = len(metrics) == 1 or len(panels) > 1  # whether the panels of a row draw the same metric
+    rows = len(metrics) if one_metric else 1
     if len(metrics) == 1:
         rows = math.ceil(len(columns) / _MOST_COLUMNS)
     width = math.ceil(len(columns) / rows)
     figure = Figure(figsize=(1.0 + 4.2 * width, 3.8 * rows), layout="constrained")
-    grid = figure.subplots(
-        rows, width, sharey="row" if len(metrics) == 1 or width == len(panels) else False, squeeze=False
-    )
+    grid = figure.subplots(rows, width, sharey="row" if one_metric else False, squeeze=False)
     for axes, (title, curves, name) in zip(grid.flat, columns, strict=False):
         draw_curves(axes, curves, name, colors(list(curves)))
         axes.set(title=title, xlabel="environment steps of each run")
         axes.legend(fontsize=8)
-        if axes not in grid[:, 0] and (len(metrics) == 1 or width == len(panels)):
+        if one_metric and axes not in grid[:, 0]:
             axes.set_ylabel("")
     for axes in grid.flat[len(columns) :]:
         axes.set_visible(False)
@@ -116,6 +114,11 @@ def draw_curves(axes: Axes, curves: Mapping[str, Rows], name: str, palette: Mapp
     """Draws curves of one metric over environment steps on given axes, with labels and limits."""
     for label, rows in curves.items():
         draw_curve(axes, rows, name, color=palette[label], label=label)
+    _set_up(axes, name)
+
+
+def _set_up(axes: Axes, name: str) -> None:
+    """Sets the label, limits, grid and number format of the axes on which a metric is drawn."""
     label, limits = AXES[name]
     axes.set_ylabel(label)
     count_frames(axes)
