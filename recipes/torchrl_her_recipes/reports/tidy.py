@@ -28,7 +28,7 @@ from torchrl_her_recipes.reports.pictures import Picture
 from torchrl_her_recipes.reports.results import Combination, read_combinations
 from torchrl_her_recipes.runs.folder import RunFolder
 from torchrl_her_recipes.runs.goal_map import GoalMap, read_arrays
-from torchrl_her_recipes.studies.seed_batches import Batches
+from torchrl_her_recipes.studies.seed_batches import Batches, number_runs
 
 _ABOUT, _RUNS, _GOALS = "about.yaml", "runs.csv", "goals.npz"
 _DAMAGE = (AttributeError, EOFError, LookupError, OSError, TypeError, ValueError, csv.Error, zlib.error)
@@ -208,17 +208,9 @@ def _read_table(folder: Path) -> dict[str, list[dict[str, float]]]:
         for line in lines:
             row = {name: number(line[name]) for name in names[numbers:] if line[name] != ""}
             tables.setdefault(line["label"], []).append(row)
-        return {label: _count(rows) for label, rows in tables.items()}
+        return {label: number_runs(rows) for label, rows in tables.items()}
     except _DAMAGE as error:
         raise ValueError(f"the table of runs in {folder} is damaged: {reason(error)}") from error
-
-
-def _count(rows: list[dict[str, float]]) -> list[dict[str, float]]:
-    """Adds the index of the run to each row; runs are numbered by their seeds, as in folders of runs."""
-    places = {seed: run for run, seed in enumerate(sorted({row["seed"] for row in rows}))}
-    return sorted(
-        ({"run": places[row["seed"]], **row} for row in rows), key=lambda row: (row["epoch"], row["run"])
-    )
 
 
 def _write_goals(cells: Sequence[Combination], path: Path) -> None:

@@ -73,22 +73,20 @@ class Batches:
     def rows(self) -> list[dict[str, float]]:
         """Joins the tables of metrics, sorted by epoch and run; runs are numbered by their seeds."""
         tables = [home.rows() for home in self.shown]
-        if not tables:
-            return []
-        seeds = sorted({row["seed"] for table in tables for row in table})
-        shared = min(table[-1]["epoch"] for table in tables)
-        rows = [
-            {**row, "run": seeds.index(row["seed"])}
-            for table in tables
-            for row in table
-            if row["epoch"] <= shared
-        ]
-        return sorted(rows, key=lambda row: (row["epoch"], row["run"]))
+        shared = min((table[-1]["epoch"] for table in tables), default=0)
+        return number_runs([row for table in tables for row in table if row["epoch"] <= shared])
 
     def goal_map(self) -> GoalMap | None:
         """Reads the maps of virtual goals of all runs as one map; None if no run has written one."""
         maps = [GoalMap.load(home.goal_map) for home in self.shown if home.goal_map.is_file()]
         return GoalMap(np.concatenate([part.counts for part in maps]), maps[0].target) if maps else None
+
+
+def number_runs(rows: Sequence[dict[str, float]]) -> list[dict[str, float]]:
+    """Numbers the runs of a table of metrics by their seeds, and sorts its rows by epoch and run."""
+    seeds = sorted({row["seed"] for row in rows})
+    numbered = [{**row, "run": seeds.index(row["seed"])} for row in rows]
+    return sorted(numbered, key=lambda row: (row["epoch"], row["run"]))
 
 
 def plan_batches(label: str, recipe: Recipe, folder: Path) -> list[Job]:
