@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import csv
 import hashlib
-import io
 import json
 import os
 import platform
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib.metadata import version
 from pathlib import Path
 
 import yaml
 from filelock import FileLock, Timeout
 
-from torchrl_her.files.writing import part_of, write_text
+from torchrl_her.files.writing import part_of, write_text, written
 from torchrl_her_recipes.config.imports import foreign_module, permit_task
 from torchrl_her_recipes.config.plain_files import naming, read_json, read_mapping, read_table
 from torchrl_her_recipes.config.policy_header import POLICY_SUFFIX
@@ -164,11 +163,10 @@ class RunFolder:
     def write_table(self, rows: Sequence[dict[str, float]]) -> None:
         """Writes the table of metrics to ``metrics.csv``."""
         columns = list(dict.fromkeys(name for row in rows for name in row))
-        table = io.StringIO()
-        writer = csv.DictWriter(table, columns, restval="nan")
-        writer.writeheader()
-        writer.writerows(rows)
-        write_text(self.metrics, table.getvalue())
+        with written(self.metrics) as part, open(part, "w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, columns, restval="nan")
+            writer.writeheader()
+            writer.writerows(rows)
 
     @property
     def _parts(self) -> list[Path]:
@@ -207,11 +205,9 @@ def remember(config: Path, task: str) -> None:
         return
     known = {path: digest for path, digest in _known().items() if Path(path).is_file()}
     known[str(config.resolve())] = _digest(config)
-    try:
+    with suppress(OSError):
         _state_file().parent.mkdir(parents=True, exist_ok=True)
         write_text(_state_file(), json.dumps(known, indent=1) + "\n")
-    except OSError:
-        pass
 
 
 def is_own(config: Path) -> bool:
