@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 from torchrl.data import TensorDictReplayBuffer
-from torchrl.envs import Compose, EnvBase
+from torchrl.envs import EnvBase
 
 from torchrl_her.behavior import BehaviorGoals
 from torchrl_her.replay_buffers.runs.buffer import bounds_of_run
@@ -47,9 +47,9 @@ def ask_for_virtual_goals(components: Components, env: EnvBase, epoch: int) -> l
         For each run, whether it has virtual goals of the full task. If not, its episodes have the task's own
         goals.
     """
-    asking, has_goals = _asking(env), []
-    widths = (env.observation_spec[key].shape[-1] for key in ("desired_goal", "observation"))
-    number, (width, observed) = asking.memory.capacity, widths
+    asking = next(part for part in env.transform.modules() if isinstance(part, BehaviorGoals))
+    number, has_goals = asking.memory.capacity, []
+    width, observed = (env.observation_spec[key].shape[-1] for key in ("desired_goal", "observation"))
     every = torch.zeros(components.recipe.run.num_runs, number, width)
     for run, seed in enumerate(eval_seeds(components.recipe.seeds, epoch)):
         goals = _virtual_goals(components.buffer, components.curriculum, run, number, seed)
@@ -77,10 +77,3 @@ def _virtual_goals(
     if state is not None and state.progress.by_episode:
         fits = fits & (rows.get("stage").squeeze(-1) == len(state.curriculum) - 1)
     return rows.get("desired_goal")[fits][:number].to("cpu", torch.float32)
-
-
-def _asking(env: EnvBase) -> BehaviorGoals:
-    """Finds the transform of an environment that proposes goals."""
-    transform = env.transform
-    parts = transform if isinstance(transform, Compose) else [transform]
-    return next(part for part in parts if isinstance(part, BehaviorGoals))
