@@ -171,9 +171,8 @@ class PolicyInfo:
             ValueError: the environments do not fit; the message lists the entries of both.
         """
         entries = describe_env(env)
-        expected = {"widths": self.widths, "action_shape": self.action_shape}
-        counts = entries["high"] == self.high if self.discrete else True
-        if {name: entries[name] for name in expected} != expected or not counts:
+        compared = ("widths", "action_shape", *(["high"] if self.discrete else []))
+        if any(entries[name] != getattr(self, name) for name in compared):
             offered = _words(entries["widths"], entries["action_shape"], entries["high"])
             raise ValueError(
                 f"a policy of {self.task} cannot play {task}: the policy has {self.expects()}, but "

@@ -126,11 +126,10 @@ def _graph_of(module: TensorPolicy, info: PolicyInfo) -> Any:
         )
     assert program is not None
     proto = program.model_proto
-    for part in (*proto.graph.node, *proto.graph.initializer, *proto.graph.value_info):
+    graph = proto.graph
+    values = (*graph.input, *graph.output, *graph.value_info)
+    for part in (proto, graph, *graph.node, *graph.initializer, *values):
         part.ClearField("metadata_props")  # stack traces, which contain paths of files
-        part.ClearField("doc_string")
-    for part in (*proto.graph.input, *proto.graph.output, proto.graph, proto):
-        part.ClearField("metadata_props")
         part.ClearField("doc_string")
     return proto
 
@@ -142,8 +141,7 @@ def _silent() -> Iterator[None]:
     level = log.level
     log.setLevel(logging.ERROR)  # suppresses a notice that torchvision is missing
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # warnings of equal batch sizes and deprecated calls
+        with warnings.catch_warnings(action="ignore"):  # of equal batch sizes and deprecated calls
             yield
     finally:
         log.setLevel(level)

@@ -140,10 +140,9 @@ class Policy(TensorDictModuleBase):
             raise ValueError(f"there is no run {chosen} in {home.path}; it has runs 0 to {runs - 1}")
         envs = TaskEnvs.of(recipe)
         env = envs.make(1, [0], scaled=False)
-        description = describe_env(env)
         info = PolicyInfo(
             task=recipe.task.name,
-            **{**description, "action_dtype": description.get("action_dtype", recipe.run.dtype)},
+            **{"action_dtype": recipe.run.dtype, **describe_env(env)},
             dtype=recipe.run.dtype,
             normalize_clip=recipe.learner.normalize_clip if recipe.learner.normalize else None,
             algorithm=recipe.hindsight.algo,
@@ -334,13 +333,8 @@ def _as_shown(actor: dict[str, Tensor], places: Tensor, width: int) -> dict[str,
     moved = dict(actor)
     for key, value in actor.items():
         if key.endswith("layers.0.0.weight"):
-            moved[key] = _wider(value, -2, width).index_add(-2, places, value)
+            moved[key] = value.new_zeros(1, width, value.shape[-1]).index_add(1, places, value)
         elif key in ("norm.n", "norm.mean", "norm.var"):
-            moved[key] = _wider(value, -1, width, key == "norm.var").index_copy(-1, places, value)
+            usual = value.new_full((1, width), float(key == "norm.var"))
+            moved[key] = usual.index_copy(1, places, value)
     return moved
-
-
-def _wider(value: Tensor, dim: int, width: int, fill: float = 0.0) -> Tensor:
-    shape = list(value.shape)
-    shape[dim] = width
-    return value.new_full(shape, fill)

@@ -59,7 +59,6 @@ class Viewer:
         _check_comparable(policies)
         self.goals, self.seed = goals, seed
         self._labels = _labels_of(policies) if named else None
-        self._opened = ExitStack()
         self._episodes: list[LiveEpisodes] = []
         with ExitStack() as opened:
             for policy in policies:
@@ -127,16 +126,11 @@ class Viewer:
 
     def frame(self) -> Tensor:
         """Returns the current picture of all policies, [height, width, 3] of uint8."""
-        if self._labels is None:
-            return beside([episodes.frame for episodes in self._episodes], gap=_GAP)
-        rows = zip(self._episodes, self._labels, self.seen, strict=True)
-        return beside(
-            [
-                underlined(episodes.frame, [label, f"{counts.achieved} of {counts.goals} achieved"])
-                for episodes, label, counts in rows
-            ],
-            gap=_GAP,
-        )
+        frames = [episodes.frame for episodes in self._episodes]
+        if self._labels is not None:
+            counts = [f"{seen.achieved} of {seen.goals} achieved" for seen in self.seen]
+            frames = list(map(underlined, frames, zip(self._labels, counts, strict=True)))
+        return beside(frames, gap=_GAP)
 
     def write(self, out: str | Path) -> list[Seen]:
         """Plays one episode for each goal, and writes a film of them.
