@@ -11,11 +11,13 @@ from multiprocessing import Pipe, get_context
 from multiprocessing.connection import Connection
 from multiprocessing.context import ForkServerContext, ForkServerProcess
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import pytest
 
 _ROOT = Path(__file__).parents[1]
+_STARTING = Lock()  # pytest clears the cache of imports, which fails if two threads do so at once
 _IMPORTED = [
     "pandas",
     "torch.utils.tensorboard",
@@ -76,7 +78,7 @@ def call_in_session(target: Callable[..., Any], *args: Any, seconds: float) -> N
 
 def _started(context: ForkServerContext, target: Callable[..., Any], *args: Any) -> ForkServerProcess:
     process = context.Process(target=target, args=args)
-    with pytest.MonkeyPatch.context() as patch:
+    with _STARTING, pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(_ROOT)  # which the new process copies
         process.start()
     return process
