@@ -231,9 +231,7 @@ def _read_goals(path: Path) -> dict[str, GoalMap]:
         return {}
     arrays = read_arrays(path)
     labels = [name.removesuffix(".counts") for name in arrays if name.endswith(".counts")]
-    return {
-        label: GoalMap.of(path, arrays[f"{label}.counts"], arrays.get(f"{label}.target")) for label in labels
-    }
+    return {label: GoalMap.of(path, arrays, f"{label}.") for label in labels}
 
 
 def _origin(homes: Sequence[RunFolder]) -> dict[str, Any]:

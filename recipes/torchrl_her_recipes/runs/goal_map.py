@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from zipfile import ZipFile
@@ -49,16 +50,16 @@ class GoalMap:
         """
         if not path.is_file():
             raise ValueError(f"{path.parent} has no {path.name}: the run has written no virtual goals")
-        arrays = read_arrays(path)
-        return cls.of(path, arrays.get("counts"), arrays.get("target"))
+        return cls.of(path, read_arrays(path))
 
     @classmethod
-    def of(cls, path: Path, counts: np.ndarray | None, target: np.ndarray | None) -> GoalMap:
-        """Checks the arrays of a file and makes a map from them.
+    def of(cls, path: Path, arrays: Mapping[str, np.ndarray], prefix: str = "") -> GoalMap:
+        """Makes a map from the arrays of a file whose names are ``counts`` and ``target`` after a prefix.
 
         Raises:
             ValueError: arrays are missing, or do not form a map; the message names the file.
         """
+        counts, target = arrays.get(f"{prefix}counts"), arrays.get(f"{prefix}target")
         if counts is None or target is None or counts.ndim < 2 or counts.shape[1:] != target.shape:
             got = [None if array is None else list(array.shape) for array in (counts, target)]
             raise ValueError(
