@@ -85,7 +85,7 @@ def bootstrap(
     if not groups:
         return [], []
 
-    firsts, seconds = (np.array([pair[end] for pair in pairs], dtype=int) for end in (0, 1))
+    firsts, seconds = np.array(pairs, dtype=int).reshape(-1, 2).T
 
     def statistic(*drawn: np.ndarray) -> np.ndarray:
         means = interquartile_means([np.concatenate([drawn[index] for index in group]) for group in groups])
@@ -96,8 +96,6 @@ def bootstrap(
     ends = drawing.conf_int(statistic, repetitions, method="percentile", size=_SIZE)
     enough = [all(len(arrays[index]) > 1 for index in group) for group in groups]
     enough += [enough[first] and enough[second] for first, second in pairs]
-    intervals = [
-        Interval(float(value), *((float(low), float(high)) if known else (np.nan, np.nan)))
-        for value, low, high, known in zip(statistic(*arrays), *ends, enough, strict=True)
-    ]
+    numbers = np.vstack([statistic(*arrays), np.where(enough, ends, np.nan)])
+    intervals = [Interval(*row) for row in numbers.T.tolist()]
     return intervals[: len(groups)], intervals[len(groups) :]

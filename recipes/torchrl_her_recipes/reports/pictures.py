@@ -88,7 +88,7 @@ def _curve(
         f"{label} {show(float(band(rows, name)[2][-1]), name)}" for label, rows in curves.items()
     )
     quantity = MEASURES.get(name, "Q of the initial state")
-    path = _save(figure, _stem(figures, name, task))
+    path = _save(figure, figures, name, task)
     return Picture(path, f"{task}: {quantity} over environment steps. Last medians: {ends}.")
 
 
@@ -115,16 +115,14 @@ def _final(
         mark = Line2D([], [], marker="D", linestyle="", color=_INK, fillstyle="none", label="published")
         figure.legend(handles=[mark], loc="outside lower center", frameon=False)
     text = ", ".join(f"{label} {show_interval(row, 'success')}" for label, (_, row) in ends.items())
-    path = _save(figure, _stem(figures, "final", task))
+    path = _save(figure, figures, "final", task)
     return Picture(path, f"{task}: success at the end. {text}.")
 
 
 def _goals(task: str, cells: Sequence[Combination], figures: Path) -> list[Picture]:
     """Draws heat maps of each algorithm's virtual goals and of their target, for throwing tasks only."""
-    if task not in TASKS:
-        return []  # only goals of the throwing tasks lie on a screen
     maps = {cell.algorithm: cell.goals for cell in cells if cell.goals is not None}
-    if not maps:
+    if task not in TASKS or not maps:  # only goals of the throwing tasks lie on a screen
         return []
     env = make_env(task)
     env.reset()
@@ -138,7 +136,7 @@ def _goals(task: str, cells: Sequence[Combination], figures: Path) -> list[Pictu
         draw_goals(axes, share, env, limit=limit)
         axes.set(xticks=[], yticks=[])
         axes.set_title(f"{task}\n{label}", fontsize=10)
-        path = _save(figure, _stem(figures, "goals", task, label)).with_suffix(".png")
+        path = _save(figure, figures, "goals", task, label).with_suffix(".png")
         pictures.append(Picture(path, f"{task}: where the virtual goals of {label} lie on the screen."))
     return pictures
 
@@ -150,15 +148,14 @@ def _panel(title: str, *, height: float = _HEIGHT) -> tuple[Figure, Axes]:
     return figure, axes
 
 
-def _save(figure: Figure, stem: Path) -> Path:
-    """Writes a figure as .svg and, for programs that cannot show it, as .png; returns the .svg's path."""
-    path = Path(f"{stem}.svg")
+def _save(figure: Figure, figures: Path, *words: str) -> Path:
+    """Writes a figure as .svg and, for programs that cannot show it, as .png; returns the .svg's path.
+
+    The files are named by the words, in characters that every file system allows.
+    """
+    stem = re.sub(r"[^\w.=-]+", "_", "_".join(words))
+    path = figures / f"{stem}.svg"
     figure.savefig(path, metadata={"Date": None})
     figure.set_layout_engine("none")  # keeps the layout: computing it again takes longer than drawing
-    figure.savefig(f"{stem}.png", dpi=120)
+    figure.savefig(figures / f"{stem}.png", dpi=120)
     return path
-
-
-def _stem(figures: Path, *words: str) -> Path:
-    """Returns the path of a picture without suffix, in characters that every file system allows."""
-    return figures / re.sub(r"[^\w.=-]+", "_", "_".join(words))

@@ -83,10 +83,8 @@ def _by_recipe(paths: Sequence[Path]) -> list[list[Path]]:
     groups: list[tuple[Recipe, set[int], list[Path]]] = []
     for path in paths:
         recipes = [home.recipe() for home in Batches(path).homes]
-        without_seeds, seeds = (
-            recipes[0].replace(seed=0, num_runs=1),
-            {seed for r in recipes for seed in r.seeds},
-        )
+        without_seeds = recipes[0].replace(seed=0, num_runs=1)
+        seeds = {seed for recipe in recipes for seed in recipe.seeds}
         for recipe, others, group in groups:
             if recipe == without_seeds and not seeds & others:
                 others |= seeds
