@@ -312,16 +312,15 @@ class _Run:
         if state is not None:
             samples = stage_success(components, state, rollout, trainer.epochs)
             measured["stage_success"] = samples.mean(1)
+            stages = [state.progress.mean_stage(run) for run in range(self.recipe.run.num_runs)]
+            name = "mean_stage" if state.progress.by_episode else "stage"
+            measured[name] = torch.tensor(stages, dtype=torch.float64)
         seconds = (self.rows[-1]["seconds"] if self.rows else 0.0) + time.perf_counter() - began
         rows = []
         for run, seed in enumerate(self.recipe.seeds):
             counters = {"run": run, "seed": seed, "epoch": trainer.epochs, "frames": trainer.frames}
             times = {"updates": trainer.updates, "seconds": seconds}
             values = {name: float(value[run]) for name, value in measured.items()}
-            if state is not None:
-                values["mean_stage" if state.progress.by_episode else "stage"] = state.progress.mean_stage(
-                    run
-                )
             rows.append({**counters, **times, **values, **written(components, run)})
         self.best.see(rows, components.greedy)  # before runs move to new stages
         if state is not None:
