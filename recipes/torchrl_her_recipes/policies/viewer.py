@@ -14,7 +14,6 @@ from torchrl_her_envs.common.live import LiveEpisodes
 from torchrl_her_envs.common.rendering.pictures import beside, underlined
 from torchrl_her_envs.common.rendering.video import write_video
 from torchrl_her_envs.registry import get_task_spec
-from torchrl_her_recipes.config.groups import TaskConfig
 from torchrl_her_recipes.policies.policy import Policy
 from torchrl_her_recipes.runs.film import FPS
 
@@ -154,7 +153,7 @@ def _check_comparable(policies: Sequence[Policy]) -> None:
     """Refuses policies of different tasks, which would have different goals in spite of equal seeds."""
     first, *others = policies
     for other in others:
-        first_task, other_task = _described(_task_of(first)), _described(_task_of(other))
+        first_task, other_task = _task_of(first), _task_of(other)
         if first_task != other_task:
             raise ValueError(
                 f"only policies of the same task can be compared: {first.source} plays {first_task}, and "
@@ -162,12 +161,9 @@ def _check_comparable(policies: Sequence[Policy]) -> None:
             )
 
 
-def _task_of(policy: Policy) -> TaskConfig:
-    return policy.recipe.replace(task=policy.info.task).task
-
-
-def _described(task: TaskConfig) -> str:
-    """Returns a task's name, followed by those of its options that differ from their defaults."""
+def _task_of(policy: Policy) -> str:
+    """Returns the name of a policy's task, followed by its options that differ from their defaults."""
+    task = policy.recipe.replace(task=policy.info.task).task
     usual: dict[str, Any] = dict(get_task_spec(task.name).options)
     options = {**usual, **(task.options or {})}
     if task.threshold is not None:

@@ -63,20 +63,20 @@ def write_page(results: Results, out: Path, *, back: str | None = None) -> Path:
 def _describe(results: Results, out: Path) -> dict[str, Any]:
     """Writes the tables and pictures of a page, and returns the variables of its template by name."""
     cells, orders = results.cells, read_orders(results.expect)
-    measures = list(dict.fromkeys([*_AT_THE_END, *results.expect]))
-    compared = [compare(cells, measure, results.published) for measure in measures]
-    finals = [row for rows, _ in compared for row in rows]
-    differences = [row for _, rows in compared for row in rows]
+    measures = dict.fromkeys([*_AT_THE_END, *results.expect])
+    compared = {measure: compare(cells, measure, results.published) for measure in measures}
+    finals = [row for rows, _ in compared.values() for row in rows]
+    differences = [row for _, rows in compared.values() for row in rows]
     judged = judge(cells, orders, differences)
     (out / "figures").mkdir(parents=True, exist_ok=True)
-    _write_tables(out, cells, finals, differences, judged)
+    _write_tables(out, cells, final=finals, differences=differences, orders=judged)
     return {
         "study": results,
         "published": results.published,
         "cells": cells,
         "averaged": _averaged(cells),
         "tasks": list(dict.fromkeys(cell.task for cell in cells)),
-        "finals": {measure: rows for measure, (rows, _) in zip(measures, compared, strict=True)},
+        "finals": {measure: rows for measure, (rows, _) in compared.items()},
         "differences": [row for row in differences if row.measure == "success"],
         "shares": _shares([row for row in finals if row.measure == "kl"]),
         "orders": _by_order(judged),
@@ -142,18 +142,13 @@ def _by_order(judged: Sequence[Judged]) -> dict[tuple[str, str], dict[str, Judge
 
 
 def _write_tables(
-    out: Path,
-    cells: Sequence[Combination],
-    finals: Sequence[Final],
-    differences: Sequence[Difference],
-    judged: Sequence[Judged],
+    out: Path, cells: Sequence[Combination], **compared: Sequence[Final | Difference | Judged]
 ) -> None:
+    """Writes the tables of runs and curves, and for each name in ``compared`` a table of its rows."""
     tables: dict[str, list[dict[str, Any]]] = {
         "runs": [{name: getattr(cell, name) for name in _ABOUT} for cell in cells],
-        "final": [asdict(row) for row in finals],
-        "differences": [asdict(row) for row in differences],
-        "orders": [asdict(row) for row in judged],
         "curves": [point for cell in cells for point in _points(cell)],
+        **{name: [asdict(row) for row in rows] for name, rows in compared.items()},
     }
     for name, rows in tables.items():
         with open(out / f"{name}.csv", "w", newline="", encoding="utf-8") as file:
