@@ -51,8 +51,10 @@ def play(
         OSError: A run has not saved a policy yet.
 
     Example:
+        >>> from tempfile import TemporaryDirectory
         >>> from torchrl_her_recipes import play
-        >>> play("hand_reach", out="reach.gif", goals=2)
+        >>> with TemporaryDirectory() as folder:
+        ...     play("hand_reach", out=f"{folder}/reach.gif", goals=2)
         [Seen(achieved=2, goals=2)]
     """
     first, *others = sources

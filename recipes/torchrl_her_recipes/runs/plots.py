@@ -32,7 +32,15 @@ COLORS = {  # color of each algorithm in all pictures; other labels use the rema
     "cher_ibs": "#0bc5ea",
     "unfiltered_cher_ibs": "#975a16",
 }
-_PANELS = tuple(AXES)[:6]  # metrics that are drawn for each run
+# Metrics that are drawn for each run.
+_PANELS = (
+    "success",
+    "distance",
+    "q_bias",
+    "loss_value",
+    "rows_real_positive",
+    "rows_useful_virtual_positive",
+)
 _REGIONS = {"goals": "#63b3ed", "reach": "#fc8181"}
 _MOST_LINES = 15  # largest number of runs for which each run has a line of its own
 _MOST_COLUMNS = 6  # largest number of panels side by side
