@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable
 from dataclasses import Field, field, fields
 from difflib import get_close_matches
@@ -11,6 +12,7 @@ from typing import Any
 from torchrl_her_recipes.config.values import as_kind
 
 _KINDS = {"str": str, "bool": bool, "int": int, "float": float}
+_LIMITS = {"at_least": operator.ge, "above": operator.gt, "at_most": operator.le, "below": operator.lt}
 
 Needs = tuple[tuple[str, Callable[[Any], object], str], ...]  # see `idle_options`
 AUTO = "auto"  # the value of an option that is chosen for the task's environment, see `.resolve`
@@ -90,14 +92,8 @@ def _check_value(definition: Field[Any], long_name: str, value: Any) -> None:
         raise ValueError(
             f"{long_name} must be one of {', '.join(choices)}, got {value!r}{nearest(value, choices)}"
         )
-    tests = {
-        "at_least": lambda limit: value >= limit,
-        "above": lambda limit: value > limit,
-        "at_most": lambda limit: value <= limit,
-        "below": lambda limit: value < limit,
-    }
     bounds = {name: limit for name, limit in limits.items() if limit is not None}
-    if not all(tests[name](limit) for name, limit in bounds.items()):  # NaN fails every test
+    if not all(_LIMITS[name](value, limit) for name, limit in bounds.items()):  # NaN fails every test
         allowed = " and ".join(f"{name.replace('_', ' ')} {limit}" for name, limit in bounds.items())
         raise ValueError(f"{long_name} must be {allowed}, got {value}")
     if isinstance(value, float) and not (isfinite(value) or definition.metadata.get("infinite")):
@@ -128,4 +124,5 @@ def what_there_is(name: object, known: Any, kind: str) -> str:
         '; the algorithms are her, cher'
     """
     hint = nearest(name, known)
-    return f"{hint} The" * bool(hint) + "; the" * (not hint) + f" {kind} are {', '.join(known)}"
+    start = f"{hint} The" if hint else "; the"
+    return f"{start} {kind} are {', '.join(known)}"
