@@ -21,13 +21,13 @@ from torchrl_her_recipes.cli.overrides import (
     sweep,
 )
 from torchrl_her_recipes.cli.say import file_name
+from torchrl_her_recipes.config import shortcuts
 from torchrl_her_recipes.config.algorithms import ALGORITHMS, STRATEGIES
 from torchrl_her_recipes.config.options import AUTO
 from torchrl_her_recipes.config.plain_files import naming
 from torchrl_her_recipes.config.presets import load_preset
 from torchrl_her_recipes.config.recipe import Recipe, make_recipe
 from torchrl_her_recipes.config.shipped import files_of_options, shipped_names
-from torchrl_her_recipes.config.shortcuts import GROUPS, KINDS, LONG_ONLY, choices_of, option_names
 
 folder_option = click.option("--folder", metavar="DIR", help="output folder")
 
@@ -99,7 +99,7 @@ class OptionsCommand(click.Command):
         folder = "folder of the run (default: a new one in runs/)"
         with formatter.section("Besides options"):
             formatter.write_dl([("preset=NAME", presets), ("folder=DIR", folder)])
-        for group, kind in GROUPS.items():
+        for group, kind in shortcuts.GROUPS.items():
             doc = (kind.__doc__ or "").splitlines()[0].rstrip(".")
             with formatter.section(f"{group}: {doc[0].lower()}{doc[1:]}"):
                 formatter.write_dl(list(_rows(group)))
@@ -107,10 +107,10 @@ class OptionsCommand(click.Command):
 
 def _rows(group: str) -> Iterator[tuple[str, str]]:
     """Yields a group's options with their help; an option that the default choice lacks names its choices."""
-    if kind := KINDS.get(group):
+    if kind := shortcuts.KINDS.get(group):
         known = f"one of {', '.join(kind)}; `torchrl-her list` describes them"
         yield _written(group, "name", kind.default), known
-    first, *_ = choices = choices_of(group)
+    first, *_ = choices = shortcuts.choices_of(group)
     plain = {
         _written(group, option.name, option.default): option.metadata["help"]
         for option in fields(choices[first])
@@ -127,7 +127,7 @@ def _rows(group: str) -> Iterator[tuple[str, str]]:
 
 def _written(group: str, name: str, default: Any) -> str:
     """Returns an option with its default in the form of the command line."""
-    key = group if name == "name" else f"{group}.{name}" if group in LONG_ONLY else name
+    key = shortcuts.short_name(group, name)
     text = str(default).lower() if isinstance(default, bool) else default
     text = f"[{','.join(default)}]" if isinstance(default, tuple) else text
     return key if default is None else f"{key}={text}"
@@ -135,25 +135,22 @@ def _written(group: str, name: str, default: Any) -> str:
 
 def complete(_context: click.Context, _parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
     """Completes names of options (short or with their group), and values of options with a list of names."""
-    options = option_names()
     name, equals, begun = incomplete.partition("=")
     if equals:
         return [
             CompletionItem(f"{name}={value}") for value in _values().get(name, []) if value.startswith(begun)
         ]
-    short = {group: names for group, names in options.items() if group not in LONG_ONLY}
-    known = [option for names in short.values() for option in names if option != "name"]
-    names = ["task", "algo", "curriculum", *KINDS, *ARGUMENTS, *known]
+    names = ["task", "algo", "curriculum", *shortcuts.KINDS, *ARGUMENTS, *shortcuts.short_names()]
     if "." in name:
-        names = [f"{group}.{option}" for group, own_names in options.items() for option in own_names]
+        names = [f"{group}.{option}" for group, known in shortcuts.option_names().items() for option in known]
     return [CompletionItem(f"{option}=") for option in dict.fromkeys(names) if option.startswith(name)]
 
 
 def _values() -> dict[str, list[str]]:
     """Returns the possible values of each option that has a fixed list of them."""
-    classes = [kind for group in GROUPS for kind in reversed(choices_of(group).values())]
+    classes = [kind for group in shortcuts.GROUPS for kind in reversed(shortcuts.choices_of(group).values())]
     choices = {option.name: list(option.metadata["choices"]) for kind in classes for option in fields(kind)}
-    return {**choices, **{group: list(kind) for group, kind in KINDS.items()}} | {
+    return {**choices, **{group: list(kind) for group, kind in shortcuts.KINDS.items()}} | {
         "task": task_names(),
         "algo": list(ALGORITHMS),
         **files_of_options(),

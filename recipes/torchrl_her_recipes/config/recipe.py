@@ -16,7 +16,7 @@ from torchrl_her_recipes.config.choices.order import ORDER, Order
 from torchrl_her_recipes.config.choices.weights import WEIGHTS, Weights
 from torchrl_her_recipes.config.imports import permit_task
 from torchrl_her_recipes.config.options import AUTO
-from torchrl_her_recipes.config.shortcuts import GROUPS, KINDS, Nested, chosen, over, place
+from torchrl_her_recipes.config.shortcuts import GROUPS, KINDS, Nested, chosen, over, place, short_name
 from torchrl_her_recipes.config.without_effect import without_effect
 
 # Options that may change when a run is resumed, since they do not affect the training done so far.
@@ -73,8 +73,7 @@ class Recipe:
         changed = self.changed()
         for (group, name), why in without_effect(self).items():
             if (value := changed.get(group, {}).get(name)) is not None:
-                option = group if name == "name" else getattr(self, group).prefix + name
-                raise ValueError(f"{option}={value} has no effect {why}: leave it out")
+                raise ValueError(f"{short_name(group, name)}={value} has no effect {why}: leave it out")
 
     def _check_proposed(self) -> None:
         """Refuses options that cannot be used together with proposed behavior goals."""

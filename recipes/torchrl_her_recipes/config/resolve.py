@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 from torchrl_her_envs.registry import get_task_spec
 from torchrl_her_recipes.config.groups import CollectionConfig, RunConfig, TaskConfig
 from torchrl_her_recipes.config.options import AUTO
 from torchrl_her_recipes.config.recipe import Recipe
+from torchrl_her_recipes.config.shortcuts import locate
 from torchrl_her_recipes.config.without_effect import without_effect
 
 TERMINATION = "termination"  # option of a task: the rule that ends an episode at its goal
@@ -88,12 +89,12 @@ def auto_options(recipe: Recipe) -> list[tuple[str, str]]:
         >>> auto_options(Recipe().replace(gamma=0.95))[1:3]
         [('hindsight', 'goal_sources'), ('collection', 'num_envs')]
     """
-    homes = {
-        option.name: group.name for group in fields(recipe) for option in fields(getattr(recipe, group.name))
-    }
-    names = [(homes[name], name) for name in _VALUES]
     idle = without_effect(recipe)
-    return [pair for pair in names if getattr(getattr(recipe, pair[0]), pair[1]) == AUTO and pair not in idle]
+    return [
+        (group, name)
+        for group, name in map(locate, _VALUES)
+        if getattr(getattr(recipe, group), name) == AUTO and (group, name) not in idle
+    ]
 
 
 def left_open(task: TaskConfig, option: str) -> bool:

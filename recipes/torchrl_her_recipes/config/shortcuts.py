@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import fields
-from functools import cache
+from functools import cache, reduce
 from typing import Any
 
 from torchrl_her_recipes.config import groups
@@ -73,6 +73,24 @@ def _names(choice: bool, *kinds: type[groups.Group]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(["name", *known] if choice else known))
 
 
+def short_name(group: str, name: str) -> str:
+    """Returns the name by which messages and help call an option: short, if its group allows that.
+
+    Example:
+        >>> short_name("run", "seed"), short_name("task", "name"), short_name("demonstrations", "file")
+        ('seed', 'task', 'demonstrations.file')
+    """
+    if name == "name":
+        return group
+    return f"{group}.{name}" if group in LONG_ONLY else name
+
+
+def short_names() -> list[str]:
+    """Returns the names of all options that have a short name."""
+    names = option_names().items()
+    return [short_name(group, name) for group, known in names if group not in LONG_ONLY for name in known]
+
+
 def chosen(group: str, *values: Nested) -> str:
     """Returns a group's ``name`` (or ``algo``): the first one set in ``values``, or else the default."""
     key = "algo" if group == "hindsight" else "name"
@@ -83,21 +101,24 @@ def chosen(group: str, *values: Nested) -> str:
     return KINDS[group].default if group in KINDS else getattr(GROUPS[group], key)
 
 
-def renamed(name: str) -> list[str]:
-    """Returns the present names of an option that was renamed or moved; empty for any other name.
+def renamed(name: str) -> str:
+    """Returns the present name of an option that was renamed or moved; empty for any other name.
 
     Example:
         >>> renamed("curriculum.window"), renamed("curriculum.order"), renamed("curriculum.stages")
-        (['order.window'], ['order'], [])
+        ('order.window', 'order', '')
         >>> renamed("learner.average_decay")
-        ['learner.ema_decay']
+        'learner.ema_decay'
     """
-    group, dot, key = str(name).partition(".")
+    group, _, key = name.partition(".")
+    names = option_names()
     if now := FORMER_NAMES.get(key or group):
-        return [group + dot + now if key else now]
-    if group not in FORMER or key in (names := option_names()).get(group, ()):
-        return []
-    return [home if key == home else f"{home}.{key}" for home in FORMER[group] if key in (home, *names[home])]
+        return f"{group}.{now}" if key else now
+    if key not in names.get(group, ()):
+        for home in FORMER.get(group, ()):
+            if key in (home, *names[home]):
+                return home if key == home else f"{home}.{key}"
+    return ""
 
 
 def locate(name: str, *values: Nested) -> tuple[str, str]:
@@ -122,7 +143,7 @@ def locate(name: str, *values: Nested) -> tuple[str, str]:
         meant = ".".join(["task.options", *([key] if key else [])])
         raise ValueError(f"options of the task are written task.options.NAME=VALUE: {meant}, not {name}")
     if now := renamed(name):
-        raise ValueError(f"{name} is called {now[0]} now")
+        raise ValueError(f"{name} is called {now} now")
     if key:
         if group not in names:
             home = next((each for each, known in names.items() if group in known and group != "name"), None)
@@ -145,14 +166,11 @@ def locate(name: str, *values: Nested) -> tuple[str, str]:
         found = having or found
     if found:
         return found[0], name
-    named = [each for each, known in names.items() if "name" in known]
     if long := [f"{group}.{name}" for group in LONG_ONLY if name in names[group]]:
         raise ValueError(f"no option {name!r}; did you mean {long[0]}?")
     if name in TASK_OPTIONS:
         raise ValueError(f"{name} is an option of the task: write task.options.{name}=...")
-    short = [known for group, known in names.items() if group not in LONG_ONLY]
-    every = [option for known in short for option in known if option != "name"] + named
-    raise ValueError(f"no option {name!r}{nearest(name, every)}; `torchrl-her train -h` lists them")
+    raise ValueError(f"no option {name!r}{nearest(name, short_names())}; `torchrl-her train -h` lists them")
 
 
 def split_name(name: str) -> list[str]:
@@ -211,10 +229,7 @@ def merge(*values: Mapping[str, Any]) -> Nested:
         >>> merge({"seed": 1, "epochs": 2}, {"run.seed": 3})
         {'run': {'seed': 3, 'epochs': 2}}
     """
-    merged: Nested = {}
-    for each in values:
-        merged = over(merged, place(each))
-    return merged
+    return reduce(over, map(place, values), {})
 
 
 def over(below: Nested, above: Nested) -> Nested:

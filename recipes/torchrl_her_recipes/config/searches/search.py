@@ -9,7 +9,7 @@ from typing import Any, Literal, get_args
 from torchrl_her_recipes.config.options import AUTO
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.config.searches.spaces import Space
-from torchrl_her_recipes.config.shortcuts import LONG_ONLY
+from torchrl_her_recipes.config.shortcuts import short_name
 
 Sampler = Literal["tpe", "random", "cmaes"]
 Pruner = Literal["median", "halving", "none"]
@@ -100,5 +100,5 @@ def _flat(search: Mapping[str, Any]) -> dict[str, Any]:
     flat |= {f"space.{name}": values for name, values in search["space"].items()}
     for group, options in search["recipe"].items():
         for name, value in options.items():
-            flat[group if name == "name" else f"{group}.{name}" if group in LONG_ONLY else name] = value
+            flat[short_name(group, name)] = value
     return flat
