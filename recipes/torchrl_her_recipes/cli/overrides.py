@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from itertools import product
 from typing import Any
 
@@ -16,23 +16,36 @@ ARGUMENTS = ("preset", "folder")  # arguments that are not options; their values
 _OPENING, _CLOSING = "[{(", "]})"
 
 
-def parse_override(text: str) -> tuple[str, str]:
-    """Splits an argument ``NAME=VALUE`` into the name and the text of the value, and checks the name.
+def parse_overrides(arguments: Iterable[str]) -> dict[str, str]:
+    """Splits arguments ``NAME=VALUE``, checks the names, and returns the text of each value by its name.
 
     Raises:
-        ValueError: the argument has no ``=``, or no option has its name.
+        ValueError: an argument has no ``=`` or no value, no option has its name, or two arguments set the
+            same option, even under different names.
 
     Example:
-        >>> parse_override("seed=3")
-        ('seed', '3')
+        >>> parse_overrides(["seed=3", "algo=her,cher"])
+        {'seed': '3', 'algo': 'her,cher'}
+        >>> parse_overrides(["seed=1", "run.seed=2"])
+        Traceback (most recent call last):
+        ValueError: seed=1 and run.seed=2 set the same option: give one of them
     """
-    name, equals, value = text.partition("=")
-    if not equals or not name:
-        raise ValueError(f"an option is written NAME=VALUE, got {text!r}{_meant(text)}")
-    if any(not part for part in split_sweep(value)):
-        raise ValueError(f"{name} needs a value, got {text!r}")
-    _path(name, value)
-    return name, value
+    texts: dict[str, str] = {}
+    before: list[tuple[tuple[str, ...], str]] = []
+    for argument in arguments:
+        name, equals, value = argument.partition("=")
+        if not equals or not name:
+            raise ValueError(f"an option is written NAME=VALUE, got {argument!r}{_meant(argument)}")
+        if any(not part for part in split_sweep(value)):
+            raise ValueError(f"{name} needs a value, got {argument!r}")
+        path = _path(name, value)
+        for other, earlier in before:
+            shared = min(len(path), len(other))
+            if path[:shared] == other[:shared]:
+                raise ValueError(f"{earlier} and {argument} set the same option: give one of them")
+        before.append((path, argument))
+        texts[name] = value
+    return texts
 
 
 def _path(name: str, value: str) -> tuple[str, ...]:
@@ -41,24 +54,6 @@ def _path(name: str, value: str) -> tuple[str, ...]:
         return (name,)
     option, *entry = split_name(name)
     return (*locate(option), *entry)
-
-
-def check_once(arguments: Sequence[tuple[str, str]]) -> None:
-    """Raises a ValueError if arguments set an option twice, even under different names.
-
-    Example:
-        >>> check_once([("seed", "1"), ("run.seed", "2")])
-        Traceback (most recent call last):
-        ValueError: seed=1 and run.seed=2 set the same option: give one of them
-    """
-    before: list[tuple[tuple[str, ...], str]] = []
-    for name, value in arguments:
-        path = _path(name, value)
-        for other, text in before:
-            shared = min(len(path), len(other))
-            if path[:shared] == other[:shared]:
-                raise ValueError(f"{text} and {name}={value} set the same option: give one of them")
-        before.append((path, f"{name}={value}"))
 
 
 def _meant(text: str) -> str:
@@ -110,14 +105,27 @@ def split_sweep(text: str) -> list[str]:
     return parts
 
 
-def sweep(arguments: Sequence[tuple[str, str]]) -> Iterator[dict[str, Any]]:
+def single(arguments: Iterable[str]) -> dict[str, Any]:
+    """Returns the values of arguments by name; raises a ValueError if an argument has several values."""
+    texts = parse_overrides(arguments)
+    for name, text in texts.items():
+        if name != "folder" and len(split_sweep(text)) > 1:
+            raise ValueError(
+                f"{name} must be one value, got {text}; several are a sweep: torchrl-her train -m"
+            )
+    return _parsed(texts)
+
+
+def sweep(texts: Mapping[str, str]) -> Iterator[dict[str, Any]]:
     """Yields all combinations of the values in a sweep, as options by name; the last option varies fastest.
 
     Example:
-        >>> list(sweep([("algo", "her,cher"), ("seed", "0,1")]))[1]
+        >>> list(sweep({"algo": "her,cher", "seed": "0,1"}))[1]
         {'algo': 'her', 'seed': 1}
     """
-    names = [name for name, _ in arguments]
-    for values in product(*(split_sweep(text) for _, text in arguments)):
-        pairs = zip(names, values, strict=True)
-        yield {name: value if name in ARGUMENTS else parse_value(value) for name, value in pairs}
+    for values in product(*map(split_sweep, texts.values())):
+        yield _parsed(dict(zip(texts, values, strict=True)))
+
+
+def _parsed(texts: Mapping[str, str]) -> dict[str, Any]:
+    return {name: text if name in ARGUMENTS else parse_value(text) for name, text in texts.items()}

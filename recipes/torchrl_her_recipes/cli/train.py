@@ -9,13 +9,13 @@ import click
 import yaml
 
 import torchrl_her_recipes as recipes  # imports torch only when one of its names is used
+from torchrl_her_recipes.cli.overrides import single
 from torchrl_her_recipes.cli.say import FAILED, INTERRUPTED, say_result, success_line
 from torchrl_her_recipes.cli.train_options import (
     OptionsCommand,
     complete,
     folder_option,
     requests,
-    single,
     with_folder,
 )
 from torchrl_her_recipes.config.imports import imported_modules, needs_permission

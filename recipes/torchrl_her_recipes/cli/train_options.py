@@ -12,14 +12,7 @@ import click
 from click.shell_completion import CompletionItem
 
 from torchrl_her_envs.registry import task_names
-from torchrl_her_recipes.cli.overrides import (
-    ARGUMENTS,
-    check_once,
-    parse_override,
-    parse_value,
-    split_sweep,
-    sweep,
-)
+from torchrl_her_recipes.cli.overrides import ARGUMENTS, parse_overrides, single, sweep
 from torchrl_her_recipes.cli.say import file_name
 from torchrl_her_recipes.config import shortcuts
 from torchrl_her_recipes.config.algorithms import ALGORITHMS, STRATEGIES
@@ -45,34 +38,16 @@ def requests(options: tuple[str, ...], *, multirun: bool) -> dict[Path, Recipe]:
         folder = values.pop("folder", None)
         recipe = _recipe(values)
         return {Path(folder or f"runs/{now}_{label(recipe)}"): recipe}
-    given = dict(_pairs(options))
+    given = parse_overrides(options)
     root = Path(given.pop("folder", "") or f"runs/sweep_{now}")
     runs: dict[Path, Recipe] = {}
-    for number, values in enumerate(sweep(list(given.items()))):
+    for number, values in enumerate(sweep(given)):
         recipe = _recipe(values)
         if recipe in runs.values():
             written = " ".join(f"{name}={value}" for name, value in values.items())
             raise ValueError(f"the sweep has the same run twice: {written}; give each value once")
         runs[root / f"{label(recipe)}_{number}"] = recipe
     return runs
-
-
-def single(options: tuple[str, ...]) -> dict[str, Any]:
-    """Returns the values of arguments by name; raises a ValueError if an argument has several values."""
-    pairs = _pairs(options)
-    for name, text in pairs:
-        if name != "folder" and len(split_sweep(text)) > 1:
-            raise ValueError(
-                f"{name} must be one value, got {text}; several are a sweep: torchrl-her train -m"
-            )
-    return {name: value if name in ARGUMENTS else parse_value(value) for name, value in pairs}
-
-
-def _pairs(options: tuple[str, ...]) -> list[tuple[str, str]]:
-    """Splits arguments into pairs of a name, which is checked, and the text of a value."""
-    pairs = [parse_override(text) for text in options]
-    check_once(pairs)
-    return pairs
 
 
 def _recipe(values: Mapping[str, Any]) -> Recipe:

@@ -10,9 +10,9 @@ import click
 from tqdm import tqdm
 
 import torchrl_her_recipes as recipes  # imports torch only when one of its names is used
-from torchrl_her_recipes.cli.overrides import ARGUMENTS
+from torchrl_her_recipes.cli.overrides import ARGUMENTS, single
 from torchrl_her_recipes.cli.say import FAILED, INTERRUPTED, fail
-from torchrl_her_recipes.cli.train_options import complete, folder_option, label, single, with_folder
+from torchrl_her_recipes.cli.train_options import complete, folder_option, label, with_folder
 from torchrl_her_recipes.config.presets import load_preset
 from torchrl_her_recipes.config.recipe import make_recipe
 from torchrl_her_recipes.config.searches.search import PRUNERS, SAMPLERS, Search

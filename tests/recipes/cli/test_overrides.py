@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from torchrl_her_recipes.cli.overrides import check_once, parse_override, parse_value, split_sweep, sweep
+from torchrl_her_recipes.cli.overrides import parse_overrides, parse_value, split_sweep, sweep
 
 
 @pytest.mark.parametrize(
@@ -41,14 +41,14 @@ def test_commas_in_brackets_and_quotes_do_not_separate(text: str, values: list[s
 
 
 def test_a_sweep_has_all_combinations_and_leaves_names_of_presets_as_they_are() -> None:
-    combinations = list(sweep([("preset", "demo,1"), ("seed", "0,1")]))
+    combinations = list(sweep({"preset": "demo,1", "seed": "0,1"}))
     assert combinations == [{"preset": name, "seed": seed} for name in ("demo", "1") for seed in (0, 1)]
 
 
 @pytest.mark.parametrize("text", ["seed=", "algo=her,", "preset=", "=3", "seed"])
 def test_what_has_no_name_or_no_value_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match="needs a value|is written NAME=VALUE"):
-        parse_override(text)
+        parse_overrides([text])
 
 
 @pytest.mark.parametrize(
@@ -63,10 +63,9 @@ def test_what_has_no_name_or_no_value_is_refused(text: str) -> None:
 )
 def test_an_option_is_given_once(names: tuple[str, str]) -> None:
     with pytest.raises(ValueError, match="set the same option: give one of them"):
-        check_once([(name, "1") for name in names])
+        parse_overrides([f"{name}=1" for name in names])
 
 
 def test_options_beside_each_other_are_no_mistake() -> None:
-    check_once(
-        [("task.options.bits", "1"), ("task.options.max_steps", "2"), ("task", "bit_flip"), ("seed", "0")]
-    )
+    given = {"task.options.bits": "1", "task.options.max_steps": "2", "task": "bit_flip", "seed": "0"}
+    assert parse_overrides(f"{name}={text}" for name, text in given.items()) == given

@@ -11,7 +11,7 @@ import pytest
 
 from torchrl_her_envs import make_env
 from torchrl_her_recipes import make_recipe
-from torchrl_her_recipes.cli.overrides import parse_override, sweep
+from torchrl_her_recipes.cli.overrides import single
 from torchrl_her_recipes.policies.model_card import card_path, check_free, training_command, write_model_card
 
 from .tiny import needs_onnx, tiny_policy
@@ -32,8 +32,7 @@ def test_the_command_trains_the_same_recipe(options: dict[str, Any]) -> None:
     recipe = make_recipe(**options)
     torchrl_her, train, *words = shlex.split(training_command(recipe))
     assert (torchrl_her, train) == ("torchrl-her", "train")
-    (values,) = sweep([parse_override(word) for word in words])
-    assert make_recipe(**values) == recipe
+    assert make_recipe(**single(words)) == recipe
 
 
 @pytest.mark.parametrize("suffix", [pytest.param(".onnx", marks=needs_onnx), ".safetensors"])
