@@ -4,8 +4,8 @@ from .common.goal_env import goal_env as goal_env
 from .common.goal_env import reward_bounds as reward_bounds
 from .common.goal_env import reward_range as reward_range
 from .common.live import LiveEpisodes as LiveEpisodes
-from .common.own_env import OwnGoalEnv as OwnGoalEnv
 from .common.own_env import make_own_env as make_own_env
+from .common.own_goal_env import OwnGoalEnv as OwnGoalEnv
 from .common.recording import record_episodes as record_episodes
 from .common.rendering.video import write_video as write_video
 from .gym.from_gym import GymGoalEnv as GymGoalEnv
