@@ -1,34 +1,22 @@
-"""The groups of options in a recipe, except those with several choices, which are in :mod:`.choices`."""
+"""The groups of options in a recipe; those with several choices are in :mod:`.choices`."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 from torchrl_her_envs.registry import check_options as check_task_options
 from torchrl_her_envs.registry import check_task, get_task_spec
 from torchrl_her_recipes.config.algorithms import Algorithm, check_goal_sources, check_strategy, get_algorithm
+from torchrl_her_recipes.config.choices.behavior import BEHAVIOR, Behavior
+from torchrl_her_recipes.config.choices.learners import LEARNERS, LearnerConfig
+from torchrl_her_recipes.config.choices.order import ORDER, Order
+from torchrl_her_recipes.config.choices.weights import WEIGHTS, Weights
 from torchrl_her_recipes.config.loggers import check_loggers
-from torchrl_her_recipes.config.options import AUTO, Needs, check_options, option
+from torchrl_her_recipes.config.options import AUTO, Group, Needs, option
 from torchrl_her_recipes.config.plain_files import read_yaml
 from torchrl_her_recipes.config.shipped import find_file
-
-
-@dataclass(frozen=True, kw_only=True)
-class Group:
-    """Base class of groups of options; an instance checks its options when it is created.
-
-    Attributes:
-        needs: Options that have an effect only with some values of another option; see ``idle_options``.
-        prefix: Text before the names of the group's options in messages.
-    """
-
-    needs: ClassVar[Needs] = ()
-    prefix: ClassVar[str] = ""
-
-    def __post_init__(self) -> None:
-        check_options(self)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -231,7 +219,7 @@ class HindsightConfig(Group):
 class CurriculumConfig(Group):
     """The stages that runs learn, one after the other or at once (Curriculum-HER)."""
 
-    needs: ClassVar[Needs] = (("guided_share", bool, "guided_per"), ("guided_share", bool, "guided_decay"))
+    needs: ClassVar[Needs] = (("guided_share", bool, "guided_per guided_decay"),)
 
     name: str = option(
         "task",
@@ -375,3 +363,21 @@ class RunConfig(Group):
         object.__setattr__(self, "log", check_loggers(self.log))
         if self.seed + self.num_runs > _SEEDS:
             raise ValueError(f"seed must be below {_SEEDS - self.num_runs + 1}, got {self.seed}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Groups:
+    """All groups of options. Each group checks its own options, but not those of other groups."""
+
+    task: TaskConfig = field(default_factory=TaskConfig)
+    hindsight: HindsightConfig = field(default_factory=HindsightConfig)
+    learner: LearnerConfig = field(default_factory=LEARNERS)
+    collection: CollectionConfig = field(default_factory=CollectionConfig)
+    replay: ReplayConfig = field(default_factory=ReplayConfig)
+    weights: Weights = field(default_factory=WEIGHTS)
+    curriculum: CurriculumConfig = field(default_factory=CurriculumConfig)
+    order: Order = field(default_factory=ORDER)
+    behavior: Behavior = field(default_factory=BEHAVIOR)
+    demonstrations: DemonstrationsConfig = field(default_factory=DemonstrationsConfig)
+    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+    run: RunConfig = field(default_factory=RunConfig)

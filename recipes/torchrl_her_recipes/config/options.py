@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable
-from dataclasses import Field, field, fields
+from dataclasses import Field, dataclass, field, fields
 from difflib import get_close_matches
 from math import isfinite
-from typing import Any
+from typing import Any, ClassVar
 
 from torchrl_her_recipes.config.values import as_kind
 
 _KINDS = {"str": str, "bool": bool, "int": int, "float": float}
 _LIMITS = {"at_least": operator.ge, "above": operator.gt, "at_most": operator.le, "below": operator.lt}
 
-Needs = tuple[tuple[str, Callable[[Any], object], str], ...]  # see `idle_options`
+Needs = tuple[tuple[str, Callable[[Any], object], str], ...]  # see `Group`
 AUTO = "auto"  # the value of an option that is chosen for the task's environment, see `.resolve`
 
 
@@ -46,44 +46,53 @@ def option(
     return field(default=default, metadata={**about, "limits": limits})
 
 
-def check_options(group: Any) -> None:
-    """Converts the values in a group of options to the types of the options, and checks their ranges."""
-    for definition in fields(group):
-        value = getattr(group, definition.name)
-        if definition.default in (None, AUTO) and value == definition.default:
-            continue
-        long_name = _shown(group, definition)
-        kind = _KINDS.get(str(definition.type).removesuffix(" | None"))
-        if kind is not None:
-            value = as_kind(long_name, value, kind)
-            object.__setattr__(group, definition.name, value)
-        _check_value(definition, long_name, value)
+@dataclass(frozen=True, kw_only=True)
+class Group:
+    """Base class of groups of options; an instance checks its options when it is created.
 
-
-def idle_options(group: Any) -> dict[str, str]:
-    """Returns the options of a group that have no effect, each with the setting that causes it.
-
-    Each entry of the group's ``needs`` has the name of an option A, a function, and names of other options,
-    separated by spaces. The other options have an effect only if the function is true of A's value.
-
-    Example:
-        >>> from torchrl_her_recipes.config.groups import CollectionConfig
-        >>> CollectionConfig.needs, idle_options(CollectionConfig(processes=0))
-        ((('processes', <class 'bool'>, 'sync'),), {'sync': 'with processes=0'})
+    Attributes:
+        needs: Options that have an effect only with some values of another option. Each entry has the name of
+            an option A, a function, and names of other options, separated by spaces. The other options have
+            an effect only if the function is true of A's value.
+        prefix: Text before the names of the group's options in messages.
     """
-    idle: dict[str, str] = {}
-    long_names = {definition.name: _shown(group, definition) for definition in fields(group)}
-    for other, has_effect, names in group.needs:
-        value = getattr(group, other)
-        if other in idle or not has_effect(value):
-            text = f"{value:g}" if isinstance(value, float) else str(value).lower()
-            for name in names.split():
-                idle.setdefault(name, idle.get(other, f"with {long_names[other]}={text}"))
-    return idle
 
+    needs: ClassVar[Needs] = ()
+    prefix: ClassVar[str] = ""
 
-def _shown(group: Any, definition: Field[Any]) -> str:
-    return definition.metadata.get("shown_as") or group.prefix + definition.name
+    def __post_init__(self) -> None:
+        """Converts the values of the options to their types, and checks the ranges of the values."""
+        for definition in fields(self):
+            value = getattr(self, definition.name)
+            if definition.default in (None, AUTO) and value == definition.default:
+                continue
+            long_name = self._shown(definition)
+            kind = _KINDS.get(str(definition.type).removesuffix(" | None"))
+            if kind is not None:
+                value = as_kind(long_name, value, kind)
+                object.__setattr__(self, definition.name, value)
+            _check_value(definition, long_name, value)
+
+    def idle_options(self) -> dict[str, str]:
+        """Returns the options that have no effect, each with the setting that causes it; see ``needs``.
+
+        Example:
+            >>> from torchrl_her_recipes.config.groups import CollectionConfig
+            >>> CollectionConfig.needs, CollectionConfig(processes=0).idle_options()
+            ((('processes', <class 'bool'>, 'sync'),), {'sync': 'with processes=0'})
+        """
+        idle: dict[str, str] = {}
+        long_names = {definition.name: self._shown(definition) for definition in fields(self)}
+        for other, has_effect, names in self.needs:
+            value = getattr(self, other)
+            if other in idle or not has_effect(value):
+                text = f"{value:g}" if isinstance(value, float) else str(value).lower()
+                for name in names.split():
+                    idle.setdefault(name, idle.get(other, f"with {long_names[other]}={text}"))
+        return idle
+
+    def _shown(self, definition: Field[Any]) -> str:
+        return definition.metadata.get("shown_as") or self.prefix + definition.name
 
 
 def _check_value(definition: Field[Any], long_name: str, value: Any) -> None:

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
-from types import SimpleNamespace
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 from torchrl_her_envs.registry import get_task_spec
-from torchrl_her_recipes.config import groups
 from torchrl_her_recipes.config.algorithms import get_algorithm
-from torchrl_her_recipes.config.choices.behavior import BEHAVIOR, Behavior, Proposed
-from torchrl_her_recipes.config.choices.learners import BY_ACTIONS, LEARNERS, LearnerConfig
-from torchrl_her_recipes.config.choices.order import ORDER, Order
-from torchrl_her_recipes.config.choices.weights import WEIGHTS, Weights
+from torchrl_her_recipes.config.choices.behavior import Proposed
+from torchrl_her_recipes.config.choices.learners import BY_ACTIONS
+from torchrl_her_recipes.config.groups import Groups
 from torchrl_her_recipes.config.imports import permit_task
 from torchrl_her_recipes.config.options import AUTO
 from torchrl_her_recipes.config.shortcuts import GROUPS, KINDS, Nested, chosen, over, place, short_name
@@ -31,7 +28,7 @@ _ALTERNATIVES = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class Recipe:
+class Recipe(Groups):
     """All options of a training run, as groups of plain values that have defaults.
 
     :func:`make_recipe` makes a recipe from short names of options. Options with the value ``auto`` are
@@ -42,23 +39,11 @@ class Recipe:
         ValueError: a value is invalid or has no effect; the message names it and what is allowed.
 
     Example:
-        >>> recipe = Recipe(hindsight=groups.HindsightConfig(algo="her"), run=groups.RunConfig(seed=3))
+        >>> from torchrl_her_recipes.config.groups import HindsightConfig, RunConfig
+        >>> recipe = Recipe(hindsight=HindsightConfig(algo="her"), run=RunConfig(seed=3))
         >>> recipe.learner.learning_rate, recipe.learner.gamma
         (0.001, 'auto')
     """
-
-    task: groups.TaskConfig = field(default_factory=groups.TaskConfig)
-    hindsight: groups.HindsightConfig = field(default_factory=groups.HindsightConfig)
-    learner: LearnerConfig = field(default_factory=LEARNERS)
-    collection: groups.CollectionConfig = field(default_factory=groups.CollectionConfig)
-    replay: groups.ReplayConfig = field(default_factory=groups.ReplayConfig)
-    weights: Weights = field(default_factory=WEIGHTS)
-    curriculum: groups.CurriculumConfig = field(default_factory=groups.CurriculumConfig)
-    order: Order = field(default_factory=ORDER)
-    behavior: Behavior = field(default_factory=BEHAVIOR)
-    demonstrations: groups.DemonstrationsConfig = field(default_factory=groups.DemonstrationsConfig)
-    evaluation: groups.EvaluationConfig = field(default_factory=groups.EvaluationConfig)
-    run: groups.RunConfig = field(default_factory=groups.RunConfig)
 
     def __post_init__(self) -> None:
         if self.hindsight.algo == AUTO and self.curriculum.stages is not None:
@@ -209,7 +194,7 @@ def compose(base: Mapping[str, Any] | None, values: Mapping[str, Any]) -> Recipe
     _drop_options_of_other_choices(below, given)
     _drop_options_of_another_task(below, given)
     drop_alternatives(below, given)
-    for group, option in without_effect(SimpleNamespace(**_groups(over(below, given)))):
+    for group, option in without_effect(Groups(**_groups(over(below, given)))):
         if option not in given.get(group, {}) and option in below.get(group, {}):
             del below[group][option]
     return Recipe(**_groups(over(below, given)))
@@ -277,6 +262,6 @@ def drop_alternatives(below: Nested, given: Nested) -> None:
 
 
 def _groups(values: Nested) -> dict[str, Any]:
-    """Makes the groups of a recipe; each group checks its own options, but not those of other groups."""
+    """Makes the groups of a recipe by their names."""
     named = {group: {"name": chosen(group, values)} for group in KINDS}
     return {group: kind(**values.get(group, {}) | named.get(group, {})) for group, kind in GROUPS.items()}

@@ -7,30 +7,16 @@ from dataclasses import fields
 from functools import cache, reduce
 from typing import Any
 
-from torchrl_her_recipes.config import groups
 from torchrl_her_recipes.config.algorithms import get_algorithm
-from torchrl_her_recipes.config.choices.behavior import BEHAVIOR
 from torchrl_her_recipes.config.choices.kind import Kind
-from torchrl_her_recipes.config.choices.learners import LEARNERS
-from torchrl_her_recipes.config.choices.order import ORDER
-from torchrl_her_recipes.config.choices.weights import WEIGHTS
-from torchrl_her_recipes.config.options import nearest, what_there_is
+from torchrl_her_recipes.config.groups import Groups
+from torchrl_her_recipes.config.options import Group, nearest, what_there_is
 
 Nested = dict[str, dict[str, Any]]
 
-GROUPS: dict[str, type[groups.Group] | Kind[Any]] = {
-    "task": groups.TaskConfig,
-    "hindsight": groups.HindsightConfig,
-    "learner": LEARNERS,
-    "collection": groups.CollectionConfig,
-    "replay": groups.ReplayConfig,
-    "weights": WEIGHTS,
-    "curriculum": groups.CurriculumConfig,
-    "order": ORDER,
-    "behavior": BEHAVIOR,
-    "demonstrations": groups.DemonstrationsConfig,
-    "evaluation": groups.EvaluationConfig,
-    "run": groups.RunConfig,
+GROUPS: dict[str, type[Group] | Kind[Any]] = {
+    group.name: group.default_factory  # type: ignore[misc]
+    for group in fields(Groups)
 }
 KINDS = {group: kind for group, kind in GROUPS.items() if isinstance(kind, Kind)}
 # former names of options, and their present names, for messages about old recipes
@@ -56,7 +42,7 @@ class Entries(dict[str, Any]):
     """Entries to set in an option that is a mapping (``task.options.bits=8``), leaving its other entries."""
 
 
-def choices_of(group: str) -> dict[str, type[groups.Group]]:
+def choices_of(group: str) -> dict[str, type[Group]]:
     """Returns the classes of a group's choices by name, the default first; {"": class} without choices."""
     kind = GROUPS[group]
     return {kind.default: kind[kind.default], **kind} if isinstance(kind, Kind) else {"": kind}
@@ -68,7 +54,7 @@ def option_names() -> dict[str, tuple[str, ...]]:
 
 
 @cache
-def _names(choice: bool, *kinds: type[groups.Group]) -> tuple[str, ...]:
+def _names(choice: bool, *kinds: type[Group]) -> tuple[str, ...]:
     known = [option.name for kind in kinds for option in fields(kind)]
     return tuple(dict.fromkeys(["name", *known] if choice else known))
 

@@ -4,23 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import fields
-from typing import Any
 
 from torchrl_her_envs.registry import get_task_spec
 from torchrl_her_recipes.config.choices.behavior import Proposed
-from torchrl_her_recipes.config.options import idle_options
+from torchrl_her_recipes.config.groups import Groups
 
 
-def without_effect(groups: Any) -> dict[tuple[str, str], str]:
-    """Returns the options that have no effect, as (group, name), each with the reason ("with k=0").
-
-    Args:
-        groups: A recipe, or any object that has the groups of a recipe as attributes.
-    """
+def without_effect(groups: Groups) -> dict[tuple[str, str], str]:
+    """Returns the options that have no effect, as (group, name), each with the reason ("with k=0")."""
     idle = {
         (group, name): why
         for group, section in vars(groups).items()
-        for name, why in idle_options(section).items()
+        for name, why in section.idle_options().items()
     }
     for holds, why, options in _rules(groups):
         for group, _, name in (option.partition(".") for option in options if holds):
@@ -28,7 +23,7 @@ def without_effect(groups: Any) -> dict[tuple[str, str], str]:
     return idle
 
 
-def _rules(groups: Any) -> Iterator[tuple[bool, str, Iterable[str]]]:
+def _rules(groups: Groups) -> Iterator[tuple[bool, str, Iterable[str]]]:
     """Yields rules: whether a condition holds, its text for messages, and options without effect then."""
     algorithm = groups.hindsight.algorithm
     learner, sources = groups.learner, groups.hindsight.sources
@@ -64,5 +59,5 @@ def _rules(groups: Any) -> Iterator[tuple[bool, str, Iterable[str]]]:
     yield groups.run.dtype == "float64", "with dtype=float64", ["learner.matmul_dtype"]
 
 
-def _options(groups: Any, group: str) -> list[str]:
+def _options(groups: Groups, group: str) -> list[str]:
     return [f"{group}.{option.name}" for option in fields(getattr(groups, group))]

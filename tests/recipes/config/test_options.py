@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 import pytest
 
-from torchrl_her_recipes.config.groups import Group
-from torchrl_her_recipes.config.options import nearest, option, what_there_is
+from torchrl_her_recipes.config.options import Group, nearest, option, what_there_is
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,7 +18,7 @@ from torchrl_her_envs.common.goal_env import Box, goal_env
 from torchrl_her_recipes.components.envs import TaskEnvs
 from torchrl_her_recipes.components.streams import Stream
 from torchrl_her_recipes.config.choices.weights import Equal, SequentialIBS
-from torchrl_her_recipes.config.groups import Group
+from torchrl_her_recipes.config.options import Group
 
 _SAMPLES = 10_000  # number of goals that are drawn from a distribution that is not uniform in a box
 _RESETS = 1_000  # number of resets whose goals are collected if the environment states no distribution

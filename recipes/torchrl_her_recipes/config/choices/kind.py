@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, ClassVar, TypeVar
 
-from torchrl_her_recipes.config.groups import Group
-from torchrl_her_recipes.config.options import REGISTERED, nearest
+from torchrl_her_recipes.config.options import REGISTERED, Group, nearest
 
 
 @dataclass(frozen=True, kw_only=True)
