@@ -10,7 +10,7 @@ import click
 from tqdm import tqdm
 
 import torchrl_her_recipes as recipes  # imports torch only when one of its names is used
-from torchrl_her_recipes.cli.overrides import ARGUMENTS, single
+from torchrl_her_recipes.cli.overrides import single
 from torchrl_her_recipes.cli.say import FAILED, INTERRUPTED, fail
 from torchrl_her_recipes.cli.train_options import complete, folder_option, label, with_folder
 from torchrl_her_recipes.config.presets import load_preset
@@ -65,7 +65,7 @@ def tune(
     num_runs seeds side by side. The same command resumes an interrupted search.
     """
     values = single(with_folder(options, folder))
-    folder, preset = (values.pop(name, None) for name in ARGUMENTS[::-1])
+    folder, preset = values.pop("folder", None), values.pop("preset", None)
     base = merge({"num_runs": _SEEDS}, load_preset(preset) if preset else {})
     recipe = make_recipe(base, **values)
     space = load_space(space_name) if space_name else space_for(recipe)

@@ -195,8 +195,8 @@ def compose(base: Mapping[str, Any] | None, values: Mapping[str, Any]) -> Recipe
     _drop_options_of_another_task(below, given)
     drop_alternatives(below, given)
     for group, option in without_effect(Groups(**_groups(over(below, given)))):
-        if option not in given.get(group, {}) and option in below.get(group, {}):
-            del below[group][option]
+        if option not in given.get(group, {}):
+            below.get(group, {}).pop(option, None)
     return Recipe(**_groups(over(below, given)))
 
 

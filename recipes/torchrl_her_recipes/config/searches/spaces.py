@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from textwrap import shorten
 from typing import TYPE_CHECKING, Any
@@ -12,7 +12,7 @@ from torchrl_her_recipes.config.choices.learners import BY_ACTIONS
 from torchrl_her_recipes.config.plain_files import read_yaml, shown
 from torchrl_her_recipes.config.recipe import Recipe, compose, drop_alternatives
 from torchrl_her_recipes.config.shipped import find_file, shipped_names
-from torchrl_her_recipes.config.shortcuts import locate, merge, place, split_name
+from torchrl_her_recipes.config.shortcuts import locate, over, place, short_name, split_name
 from torchrl_her_recipes.config.values import as_kind
 from torchrl_her_recipes.config.without_effect import without_effect
 
@@ -65,14 +65,14 @@ class Space:
         """Returns Optuna's distributions by the names of the options, as ``study.ask`` takes them."""
         return {name: _distribution(**values) for name, values in self.ranges.items()}
 
-    def without(self, names: Mapping[str, Any]) -> Space:
-        """Returns a copy of the space without the named options, whose values are given.
+    def without(self, names: Iterable[str]) -> Space:
+        """Returns a copy of the space without the named options.
 
         Raises:
             ValueError: no option is left.
 
         Example:
-            >>> load_space("dqn").without({"learner.gamma": 0.9}).ranges.get("gamma")
+            >>> load_space("dqn").without(["learner.gamma"]).ranges.get("gamma")
         """
         fixed = {locate(split_name(name)[0]) for name in names}
         left = {name: values for name, values in self.ranges.items() if locate(name) not in fixed}
@@ -104,7 +104,7 @@ class Space:
         """
         given = place(values, base.to_dict())
         drop_alternatives({}, given)
-        return compose(merge(base.to_dict(), given), {})
+        return compose(over(base.to_dict(), given), {})
 
     def values_of(self, recipe: Recipe) -> dict[str, Any]:
         """Returns the values that a recipe has for the varied options, except options without effect."""
@@ -128,7 +128,7 @@ class Space:
 
 def _checked(name: str, values: Any) -> dict[str, Any]:
     """Checks the range of an option and returns it, with text such as ``1e-4`` converted to numbers."""
-    if (home := locate(name))[1] in _SAME_FOR_ALL or home == ("task", "name"):
+    if short_name(*locate(name)) in _SAME_FOR_ALL:
         raise ValueError(f"{name} must be the same in all trials of a search: it cannot be varied")
     if not isinstance(values, Mapping) or "kind" not in values:
         example = "{kind: float, low: 0, high: 1}"
@@ -214,6 +214,4 @@ def space_for(recipe: Recipe) -> Space:
     if learner not in space_names():
         known = ", ".join(space_names())
         raise ValueError(f"there is a search space for {known}, not for {learner}: give --space FILE")
-    space, idle = load_space(learner), without_effect(recipe)
-    left = {name: values for name, values in space.ranges.items() if locate(name) not in idle}
-    return replace(space, ranges=left)
+    return load_space(learner).without(f"{group}.{option}" for group, option in without_effect(recipe))
