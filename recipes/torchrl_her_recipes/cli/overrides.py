@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from itertools import product
 from typing import Any
 
@@ -56,17 +56,15 @@ def _path(name: str, value: str) -> tuple[str, ...]:
     return (*locate(option), *entry)
 
 
+def named_values() -> dict[str, Collection[str]]:
+    """Returns the names that an option can be set to, by option: tasks, algorithms, presets and so on."""
+    return {"task": task_names(), "algo": ALGORITHMS, **KINDS, **files_of_options()}
+
+
 def _meant(text: str) -> str:
     """Returns a hint if an argument is a known value without its option, as in ``hand_v0``; else ""."""
-    for name, known in (
-        ("task", task_names()),
-        ("algo", ALGORITHMS),
-        *KINDS.items(),
-        *files_of_options().items(),
-    ):
-        if text in known:
-            return f"; did you mean {name}={text}?"
-    return ""
+    option = next((option for option, known in named_values().items() if text in known), None)
+    return "" if option is None else f"; did you mean {option}={text}?"
 
 
 def parse_value(text: str) -> Any:

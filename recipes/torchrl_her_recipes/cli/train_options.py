@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import fields
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 import click
-from click.shell_completion import CompletionItem
 
-from torchrl_her_envs.registry import task_names
-from torchrl_her_recipes.cli.overrides import ARGUMENTS, parse_overrides, single, sweep
+from torchrl_her_recipes.cli.overrides import ARGUMENTS, named_values, parse_overrides, single, sweep
 from torchrl_her_recipes.cli.say import file_name
 from torchrl_her_recipes.config import shortcuts
-from torchrl_her_recipes.config.algorithms import ALGORITHMS, STRATEGIES
+from torchrl_her_recipes.config.algorithms import STRATEGIES
 from torchrl_her_recipes.config.options import AUTO
 from torchrl_her_recipes.config.plain_files import naming
 from torchrl_her_recipes.config.presets import load_preset
 from torchrl_her_recipes.config.recipe import Recipe, make_recipe
-from torchrl_her_recipes.config.shipped import files_of_options, shipped_names
+from torchrl_her_recipes.config.shipped import shipped_names
 
 folder_option = click.option("--folder", metavar="DIR", help="output folder")
 
@@ -108,26 +106,19 @@ def _written(group: str, name: str, default: Any) -> str:
     return key if default is None else f"{key}={text}"
 
 
-def complete(_context: click.Context, _parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
+def complete(_context: click.Context, _parameter: click.Parameter, incomplete: str) -> list[str]:
     """Completes names of options (short or with their group), and values of options with a list of names."""
     name, equals, begun = incomplete.partition("=")
     if equals:
-        return [
-            CompletionItem(f"{name}={value}") for value in _values().get(name, []) if value.startswith(begun)
-        ]
+        return [f"{name}={value}" for value in _values().get(name, ()) if value.startswith(begun)]
     names = ["task", "algo", "curriculum", *shortcuts.KINDS, *ARGUMENTS, *shortcuts.short_names()]
     if "." in name:
         names = [f"{group}.{option}" for group, known in shortcuts.option_names().items() for option in known]
-    return [CompletionItem(f"{option}=") for option in dict.fromkeys(names) if option.startswith(name)]
+    return [f"{option}=" for option in dict.fromkeys(names) if option.startswith(name)]
 
 
-def _values() -> dict[str, list[str]]:
+def _values() -> dict[str, Collection[str]]:
     """Returns the possible values of each option that has a fixed list of them."""
     classes = [kind for group in shortcuts.GROUPS for kind in reversed(shortcuts.choices_of(group).values())]
-    choices = {option.name: list(option.metadata["choices"]) for kind in classes for option in fields(kind)}
-    return {**choices, **{group: list(kind) for group, kind in shortcuts.KINDS.items()}} | {
-        "task": task_names(),
-        "algo": list(ALGORITHMS),
-        **files_of_options(),
-        "strategy": list(STRATEGIES),
-    }
+    choices = {option.name: option.metadata["choices"] for kind in classes for option in fields(kind)}
+    return {**choices, **named_values(), "strategy": STRATEGIES}

@@ -16,7 +16,7 @@ from torchrl_her_recipes.config.shortcuts import LONG_ONLY, option_names
 
 
 def completed(text: str) -> list[str]:
-    return [item.value for item in complete(click.Context(train), train.params[-1], text)]
+    return complete(click.Context(train), train.params[-1], text)
 
 
 def test_completion_of_names_and_values() -> None:
