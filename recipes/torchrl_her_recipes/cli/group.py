@@ -16,15 +16,7 @@ from torchrl_her_recipes.cli.listing import listing
 from torchrl_her_recipes.cli.play import export, play
 from torchrl_her_recipes.cli.plot import plot
 from torchrl_her_recipes.cli.record import record
-from torchrl_her_recipes.cli.say import (
-    BAD_INPUT,
-    BAD_INPUT_ERRORS,
-    INTERRUPTED,
-    fail,
-    one_line,
-    say_line,
-    say_warning,
-)
+from torchrl_her_recipes.cli.say import BAD_INPUT, INTERRUPTED, fail, one_line, say_line, say_warning
 from torchrl_her_recipes.cli.study import report, study
 from torchrl_her_recipes.cli.train import train
 from torchrl_her_recipes.cli.tune import tune
@@ -130,7 +122,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return fail(click.NoSuchOption(error.option_name, possibilities=near).format_message().rstrip("."))
     except click.ClickException as error:
         return fail(error.format_message().rstrip("."))
-    except BAD_INPUT_ERRORS as error:
+    except (OSError, ValueError, ImportError, MemoryError) as error:
         return fail(one_line(error))
     except RuntimeError as error:
         # Torch's errors of full memory: known by type on a GPU and by text on a CPU, without importing torch.

@@ -16,7 +16,6 @@ if TYPE_CHECKING:  # not at runtime, since this import would import torch
 
 FAILED = 1
 BAD_INPUT = 2
-BAD_INPUT_ERRORS = (OSError, ValueError, ImportError, MemoryError)
 INTERRUPTED = 130
 
 _HARDLY = 0.1  # below this success, a run has hardly learned anything
@@ -62,6 +61,14 @@ def say_result(result: StudyResult, *, of: str = "") -> None:
         fail(f"{of}{label} failed: {reason}")
     for label, successes in result.successes.items():
         click.echo(f"{label}: {success_line(successes)}")
+
+
+def exit_code(*, interrupted: bool, failed: bool) -> int:
+    """Returns the exit code of a command that trains several runs, and prints how to resume it."""
+    if interrupted:
+        click.echo("interrupted: the same command resumes it")
+        return INTERRUPTED
+    return FAILED if failed else 0
 
 
 def success_line(successes: Sequence[float]) -> str:

@@ -10,7 +10,7 @@ import yaml
 
 import torchrl_her_recipes as recipes  # imports torch only when one of its names is used
 from torchrl_her_recipes.cli.overrides import single
-from torchrl_her_recipes.cli.say import FAILED, INTERRUPTED, say_result, success_line
+from torchrl_her_recipes.cli.say import INTERRUPTED, exit_code, say_result, success_line
 from torchrl_her_recipes.cli.train_options import (
     OptionsCommand,
     complete,
@@ -110,10 +110,7 @@ def _sweep(requested: dict[Path, Recipe], jobs: int | None, *, anew: bool) -> in
         left = len(runs) - len(result.successes)
         unfinished = f"; {left} of {len(runs)} did not end" if left else ""
         click.echo(f"the whole sweep: {success_line(every)}{unfinished}")
-    if result.interrupted:
-        click.echo("interrupted: the same command resumes it")
-        return INTERRUPTED
-    return FAILED if result.failed else 0
+    return exit_code(interrupted=result.interrupted, failed=bool(result.failed))
 
 
 def _say_finished(home: recipes.RunFolder, changes: dict[str, Any]) -> None:

@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 import torchrl_her_recipes as recipes  # imports torch only when one of its names is used
 from torchrl_her_recipes.cli.overrides import single
-from torchrl_her_recipes.cli.say import FAILED, INTERRUPTED, fail
+from torchrl_her_recipes.cli.say import exit_code, fail
 from torchrl_her_recipes.cli.train_options import complete, folder_option, label, with_folder
 from torchrl_her_recipes.config.presets import load_preset
 from torchrl_her_recipes.config.recipe import make_recipe
@@ -90,7 +90,4 @@ def _say(result: SearchResult) -> int:
         click.echo(line)
     if result.best is not None:
         click.echo(f"the best: torchrl-her train preset={result.folder / 'best.yaml'}")
-    if result.interrupted:
-        click.echo("interrupted: the same command resumes it")
-        return INTERRUPTED
-    return FAILED if result.best is None else 0
+    return exit_code(interrupted=result.interrupted, failed=result.best is None)
