@@ -79,9 +79,8 @@ def needs_permission(task: str, named: Collection[str] = ()) -> bool:
         >>> needs_permission("package.envs:make_env"), needs_permission("package.envs:f", ["package"])
         (True, False)
     """
-    parts = foreign_module(task).split(".")
-    known = {".".join(parts[: count + 1]) for count in range(len(parts))}
-    return parts != [""] and not known & {*named, *_imported}
+    module, known = foreign_module(task), (*named, *_imported)
+    return bool(module) and not any(f"{module}.".startswith(f"{name}.") for name in known)
 
 
 def permit_task(task: str) -> None:

@@ -147,9 +147,9 @@ class Study:
 
     def combinations(self) -> Iterator[dict[str, Any]]:
         """Yields each combination: values of the options that vary, and a case's name if there are any."""
-        for values in product(*self.vary.values()):
-            varied = dict(zip(self.vary, values, strict=True))
-            yield from ({**varied, "case": case} for case in self.cases) if self.cases else (varied,)
+        axes = {**self.vary, "case": self.cases} if self.cases else self.vary
+        for values in product(*axes.values()):
+            yield dict(zip(axes, values, strict=True))
 
     def cells(self) -> Iterator[tuple[str, Recipe]]:
         """Yields the name and the recipe of each combination; the recipe trains all seeds.
