@@ -334,7 +334,7 @@ class StageOutcomes(Transform):
         progress: EpisodeStages,
         *,
         reward_fn: RewardFunction | None = None,
-        achieved_reward: float = 0.0,
+        achieved_reward: float | None = None,
         keys: EnvKeys = EnvKeys(),
         stage_key: NestedKey = "stage",
     ) -> None:

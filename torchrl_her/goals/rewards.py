@@ -63,8 +63,10 @@ def achieved(achieved_goal: Tensor, desired_goal: Tensor, threshold: float) -> T
     Returns:
         Mask [...] of achieved goals.
     """
-    if not achieved_goal.is_floating_point():  # squares of int8, for example, overflow
-        achieved_goal, desired_goal = achieved_goal.float(), desired_goal.float()
+    if (widths := [goal.shape[-1] for goal in (achieved_goal, desired_goal)])[0] != widths[1]:
+        raise ValueError(f"goals must have one width, got {widths[0]} and {widths[1]}")
+    if achieved_goal.dtype not in (torch.float32, torch.float64):  # squares of int8 overflow, for example
+        achieved_goal, desired_goal = achieved_goal.double(), desired_goal.double()
     # Coordinates are added one by one: torch takes several times as long to sum over a short dimension.
     pairs = zip(achieved_goal.unbind(-1), desired_goal.unbind(-1), strict=True)
     return reduce(torch.add, [(one - other).square() for one, other in pairs]) < threshold**2
@@ -267,7 +269,7 @@ def _checked(reward: Tensor, shape: torch.Size) -> Tensor:
 
 
 def missed(
-    reward_fn: RewardFunction, achieved: Outcome, desired_goal: Tensor, achieved_reward: float
+    reward_fn: RewardFunction, achieved: Outcome, desired_goal: Tensor, achieved_reward: float | None
 ) -> Tensor:
     """Returns a mask [...] of the pairs of goals [..., g] whose reward is below the given one.
 
@@ -277,7 +279,7 @@ def missed(
         reward_fn: maps (achieved, desired) goals to (reward, terminated).
         achieved: goals [..., g], with the info that the function reads (``outcomes``).
         desired_goal: [..., g], broadcast against the achieved goals.
-        achieved_reward: the reward of an achieved goal.
+        achieved_reward: the least reward of an achieved goal; None as for :func:`is_achieved`.
 
     Raises:
         ValueError: there is not one finite reward for each pair of goals.
@@ -286,7 +288,17 @@ def missed(
         value = reward_fn.compute_reward(*_arguments(achieved, desired_goal))
     else:
         value = _call(reward_fn, achieved, desired_goal)[0]
-    return _checked(value, _pairs(achieved, desired_goal)) < achieved_reward
+    return _checked(value, _pairs(achieved, desired_goal)) < achieved_reward_of(reward_fn, achieved_reward)
+
+
+def achieved_reward_of(reward_fn: RewardFunction | None, given: float | None) -> float:
+    """Returns the least reward of an achieved goal: the given one, or else the reward function's, or 0.
+
+    Example:
+        >>> achieved_reward_of(GoalReward(0.1, missed_reward=0.0, achieved_reward=1.0), None)
+        1.0
+    """
+    return float(getattr(reward_fn, "achieved_reward", 0.0) if given is None else given)
 
 
 def ends_at_goals(reward_fn: RewardFunction, goals: Outcome) -> bool:
@@ -306,7 +318,7 @@ def ends_at_goals(reward_fn: RewardFunction, goals: Outcome) -> bool:
 
 
 def is_achieved(
-    after: TensorDictBase, reward_fn: RewardFunction | None = None, *, achieved_reward: float = 0.0
+    after: TensorDictBase, reward_fn: RewardFunction | None = None, *, achieved_reward: float | None = None
 ) -> Tensor:
     """Returns whether steps achieved their goals: by the environment's own flag, else by a reward function.
 
@@ -318,7 +330,8 @@ def is_achieved(
         reward_fn: maps (achieved, desired) goals to (reward, terminated); None for the reward of the step.
 
     Keyword Args:
-        achieved_reward: the least reward of an achieved goal.
+        achieved_reward: the least reward of an achieved goal; None for that of the reward function, if it has
+            an attribute of this name as :class:`~torchrl_her.GoalReward` has, or else 0.
 
     Returns:
         Mask [...] of the steps that achieved their goals.
@@ -334,6 +347,6 @@ def is_achieved(
     if word is not None:
         return word.bool().view(after.shape)
     if reward_fn is None:
-        return (after.get("reward") >= achieved_reward).view(after.shape)
+        return (after.get("reward") >= achieved_reward_of(None, achieved_reward)).view(after.shape)
     reached = outcomes(reward_fn, after.get("achieved_goal"), after)
     return ~missed(reward_fn, reached, after.get("desired_goal"), achieved_reward)

@@ -10,7 +10,7 @@ from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 
 from torchrl_her.checks import check_finite, entry_of
-from torchrl_her.goals.rewards import Outcome, RewardFunction, ask_reward, outcomes
+from torchrl_her.goals.rewards import Outcome, RewardFunction, achieved_reward_of, ask_reward, outcomes
 
 LEAST_COST = 1e-4  # smaller differences, relative to a reward, are rounding errors and no cost
 
@@ -76,7 +76,7 @@ class TransitionKeys:
             )
 
     def rewards(
-        self, rows: TensorDictBase, reward_fn: RewardFunction, achieved_reward: float
+        self, rows: TensorDictBase, reward_fn: RewardFunction, achieved_reward: float | None
     ) -> tuple[Tensor, Tensor]:
         """Returns the rewards [n] of a function plus the costs of failures, and the collected rewards [n]."""
         computed, _ = ask_reward(reward_fn, self.after(rows, reward_fn), entry_of(rows, self.goals[1]))
@@ -102,7 +102,10 @@ class TransitionKeys:
 
 
 def failures(
-    transitions: TensorDictBase, keys: TransitionKeys, reward_fn: RewardFunction, achieved_reward: float
+    transitions: TensorDictBase,
+    keys: TransitionKeys,
+    reward_fn: RewardFunction,
+    achieved_reward: float | None,
 ) -> tuple[Tensor, Tensor]:
     """Returns where an episode terminated without achieving its goal, such as by a fall, and the cost.
 
@@ -124,7 +127,8 @@ def failures(
         ([[False], [True]], [[0.0], [-5.0]])
     """
     reward, terminated = (entry_of(transitions, key).reshape(-1) for key in (keys.reward, keys.terminated))
-    failed, cost = terminated & (reward < achieved_reward), torch.zeros_like(reward)
+    least = achieved_reward_of(reward_fn, achieved_reward)
+    failed, cost = terminated & (reward < least), torch.zeros_like(reward)
     at = failed.nonzero().squeeze(-1)
     if len(at) > 0:  # if the reward function ends the episode, it is a success, whatever its reward
         reached, desired = keys.after(transitions, reward_fn)[at], entry_of(transitions, keys.goals[1])[at]

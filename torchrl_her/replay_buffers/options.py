@@ -12,9 +12,9 @@ from typing import Any, Literal, get_args
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 
-from torchrl_her.checks import check_whole
+from torchrl_her.checks import check_whole, entry_of
 from torchrl_her.env_keys import EnvKeys
-from torchrl_her.goals.rewards import RewardFunction
+from torchrl_her.goals.rewards import RewardFunction, ask_reward
 from torchrl_her.goals.strategies import (
     RECENT,
     GoalSources,
@@ -70,9 +70,11 @@ class HindsightOptions:
             transition for it.
         achieved_reward: the reward of an achieved goal; with any lower reward a goal is not achieved. A
             transition that terminated with a lower reward failed, such as by a fall: it also terminates for
-            virtual goals, with the same reward.
-        exclude: entries to leave out, in the root and under ``next``. By default ``state``, because it
-            holds the real goal. Add whatever else was computed from the desired goal.
+            virtual goals, with the same reward. None: the ``achieved_reward`` of the reward function, as
+            :class:`~torchrl_her.GoalReward` has it, or else 0.
+        exclude: entries to leave out, in the root and under ``next``; the observation is never left out. By
+            default ``state``, because it holds the real goal. Add whatever else was computed from the desired
+            goal.
         keys: keys of the goals, in the root and under ``next``, and of reward and flags under ``next``.
         trajectory_key: key of ids that distinguish trajectories; the entry may be missing.
         env_ids_key: key of ids that distinguish environments, as :class:`~torchrl_her.EnvIds` makes them; the
@@ -108,7 +110,7 @@ class HindsightOptions:
     gamma: float | None = None
     filter_achieved: bool = False
     redraw: bool = True
-    achieved_reward: float = 0.0
+    achieved_reward: float | None = None
     exclude: Sequence[NestedKey] = ("state",)
     keys: EnvKeys = EnvKeys()
     trajectory_key: NestedKey = ("collector", "traj_ids")
@@ -130,7 +132,7 @@ class HindsightOptions:
             )
         if self.n_steps > 1 and (self.gamma is None or not 0 < self.gamma <= 1):
             raise ValueError(f"n_steps={self.n_steps} needs the loss's gamma, in (0, 1], got {self.gamma}")
-        if not math.isfinite(self.achieved_reward):
+        if self.achieved_reward is not None and not math.isfinite(self.achieved_reward):
             raise ValueError(f"achieved_reward must be finite, got {self.achieved_reward}")
         get_strategy(self.strategy)
         in_root_and_next(self.exclude)
@@ -240,19 +242,16 @@ class HindsightBase:
 
     Attributes:
         options: all options; assign another :class:`~torchrl_her.HindsightOptions` to change them.
-        k, strategy, goal_sources, filter_achieved, achieved_reward: the options of these names, which can
-            also be set here.
+        k, strategy, ...: each option by its name, which can also be set here.
 
     Raises:
         ValueError: an option is out of its range.
         TypeError: an option is unknown.
     """
 
-    k: int = _option("k")
-    strategy: Strategy = _option("strategy")
-    goal_sources: GoalSources | None = _option("goal_sources")
-    filter_achieved: bool = _option("filter_achieved")
-    achieved_reward: float = _option("achieved_reward")
+    k: int
+    filter_achieved: bool
+    achieved_reward: float | None
 
     def __init__(
         self,
@@ -282,10 +281,12 @@ class HindsightBase:
     def options(self, options: HindsightOptions) -> None:
         self._options = options
         self._keys = options.transition_keys()
-        self._exclude = in_root_and_next([*options.exclude, options.real_goal_key])
+        shown = unravel_key(options.keys.observation)
+        excluded = [key for key in (*options.exclude, options.real_goal_key) if unravel_key(key) != shown]
+        self._exclude = in_root_and_next(excluded)
 
     def _compare_rewards(self, rows: TensorDictBase) -> None:
-        """Warns if rewards of the first rows [n] ever written differ from the reward function's."""
+        """Warns if the first rows [n] ever written show that rewards or ``achieved_reward`` are wrong."""
         if self._compared or self.k == 0:
             return
         self._compared = True
@@ -297,6 +298,16 @@ class HindsightBase:
                 f"the reward function gives {one:g} where the collected reward is {other:g}, and other ones "
                 f"in {len(differ):,} of {len(reward):,} rows; pass the environment's own rule, since "
                 "virtual transitions get the rewards of this function (this warning appears once)",
+                stacklevel=4,
+            )
+        if self.achieved_reward is not None or hasattr(self.reward_fn, "achieved_reward"):
+            return
+        goals = entry_of(rows, self._keys.next_achieved)
+        equal = ask_reward(self.reward_fn, self._keys.after(rows, self.reward_fn), goals)[0].max().item()
+        if abs(equal) > LEAST_COST:
+            warnings.warn(
+                f"goals with a reward of at least 0 count as achieved, but equal goals have {equal:g}; give "
+                f"the reward of an achieved goal, achieved_reward={equal:g} (this warning appears once)",
                 stacklevel=4,
             )
 
@@ -314,3 +325,7 @@ class HindsightBase:
                 stacklevel=5,
             )
         self._time_seen = several or suspicious
+
+
+for _field in fields(HindsightOptions):
+    setattr(HindsightBase, _field.name, _option(_field.name))

@@ -35,7 +35,7 @@ def at_the_end(rollout: TensorDictBase, values: Tensor) -> Tensor:
 
 
 def success(
-    rollout: TensorDictBase, reward_fn: RewardFunction | None = None, *, achieved_reward: float = 0.0
+    rollout: TensorDictBase, reward_fn: RewardFunction | None = None, *, achieved_reward: float | None = None
 ) -> Tensor:
     """Returns whether the goal is achieved at the last step of the episode, as papers on Fetch measure it.
 
@@ -45,7 +45,7 @@ def success(
             see :func:`~torchrl_her.goals.is_achieved`.
 
     Keyword Args:
-        achieved_reward: the least reward of an achieved goal.
+        achieved_reward: the least reward of an achieved goal; None for that of the reward function, or 0.
 
     Returns:
         Mask [N] of the successful episodes.
@@ -61,7 +61,7 @@ def success(
 
 
 def reached(
-    rollout: TensorDictBase, reward_fn: RewardFunction | None = None, *, achieved_reward: float = 0.0
+    rollout: TensorDictBase, reward_fn: RewardFunction | None = None, *, achieved_reward: float | None = None
 ) -> Tensor:
     """Returns whether the goal is achieved at some step; arguments as for :func:`torchrl_her.success`."""
     inside = first_episode(rollout.get(("next", "done")).squeeze(-1))

@@ -38,7 +38,7 @@ def test_all_coordinates_count() -> None:
 
 
 def test_goals_of_different_widths_are_refused() -> None:
-    with pytest.raises(ValueError, match="shorter"):
+    with pytest.raises(ValueError, match="goals must have one width, got 2 and 1"):
         achieved(torch.zeros(4, 2), torch.zeros(4, 1), 0.1)
 
 
@@ -118,6 +118,11 @@ def test_whole_numbers_do_not_wrap_around(dtype: torch.dtype) -> None:
     assert achieved(here, there, 0.5).tolist() == [False, True]
     reward, terminated = GoalReward(0.5)(here, there)
     assert (reward.flatten().tolist(), terminated.flatten().tolist()) == ([-1.0, 0.0], [False, True])
+
+
+def test_neighboring_numbers_stay_different_and_small_thresholds_stay_above_0() -> None:
+    assert achieved(torch.tensor([2**24]), torch.tensor([2**24 + 1]), 0.5).tolist() is False
+    assert achieved(torch.zeros(1).half(), torch.zeros(1).half(), 1e-4).tolist() is True
 
 
 @pytest.mark.parametrize(

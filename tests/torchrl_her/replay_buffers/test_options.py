@@ -15,6 +15,7 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 from torchrl_her import (
     EnvKeys,
+    EnvReward,
     GoalReward,
     GoalWeights,
     HERSampleUnit,
@@ -51,13 +52,16 @@ OTHERS = {
 both = pytest.mark.parametrize("make", [HERWriter, HERSampleUnit])
 
 
-def relabeled(make: Callable[..., Any], *args: Any, **options: Any) -> TensorDict:
+def relabeled(make: Callable[..., Any], *args: Any, reward: Any = REWARD, **options: Any) -> TensorDict:
     """Ten episodes of four steps: as they are stored by a writer, or a sample of them by a unit."""
-    part = make(REWARD, *args, **options)
+    part = make(reward, *args, **options)
     parts = {"writer": part} if make is HERWriter else {"sample_unit": part, "collate_fn": part.relabel}
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(1_000), batch_size=2_000, **parts)
     buffer.set_rng(torch.Generator().manual_seed(3))
-    buffer.extend(make_batch([[4] * 10]).squeeze(0))
+    batch = make_batch([[4] * 10]).squeeze(0)
+    after = batch["next"]
+    after["reward"] = reward(after["achieved_goal"], after["desired_goal"])[0].view_as(after["reward"])
+    buffer.extend(batch)
     return buffer[:] if make is HERWriter else buffer.sample()
 
 
@@ -104,6 +108,42 @@ def test_options_are_read_and_set_as_attributes(make: Callable[..., Any]) -> Non
     part.options = replace(part.options, keys=EnvKeys(reward="cost"), exclude=("seen",), real_goal_key="real")
     assert part._keys.reward == ("next", "cost")
     assert part._exclude == ["seen", ("next", "seen"), "real", ("next", "real")]
+
+
+@both
+def test_every_option_can_be_set_as_an_attribute(make: Callable[..., Any]) -> None:
+    part = make(REWARD)
+    for name, value in OTHERS.items():
+        setattr(part, name, value)
+    assert part.options == HindsightOptions(**OTHERS)
+    assert {name: getattr(part, name) for name in OTHERS} == OTHERS
+
+
+@both
+@pytest.mark.parametrize(("lost", "won"), [(0.0, 1.0), (-2.0, -1.0)])
+def test_a_reward_function_says_which_reward_an_achieved_goal_has(
+    make: Callable[..., Any], lost: float, won: float
+) -> None:
+    rule = GoalReward(0.5, missed_reward=lost, achieved_reward=won)
+    rows, usual = (relabeled(make, filter_achieved=True, reward=reward) for reward in (rule, REWARD))
+    assert torch.equal(rows["virtual"], usual["virtual"])
+    assert torch.equal(rows["next", "reward"] == won, usual["next", "reward"] == 0.0)
+
+
+@both
+def test_a_reward_of_equal_goals_that_does_not_count_as_achieved_is_named(make: Callable[..., Any]) -> None:
+    rule = GoalReward(0.5, missed_reward=0.0, achieved_reward=1.0)
+    with pytest.warns(UserWarning, match="equal goals have 1; give the reward .* achieved_reward=1 "):
+        relabeled(make, reward=EnvReward(lambda *goals: rule(*goals)[0]))
+    relabeled(make, reward=EnvReward(lambda *goals: rule(*goals)[0]), achieved_reward=1.0)
+
+
+@both
+def test_the_observation_is_stored_whatever_its_name(make: Callable[..., Any]) -> None:
+    assert make(REWARD, keys=EnvKeys(observation="state"))._exclude == [
+        "real_desired_goal",
+        ("next", "real_desired_goal"),
+    ]
 
 
 @both

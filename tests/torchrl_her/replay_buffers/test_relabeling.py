@@ -103,7 +103,7 @@ def test_a_real_termination_is_undone_where_the_goal_is_not_reached(relabel: Rel
     reward = EnvReward(
         lambda a, d: -torch.ones_like(a[..., :1]), lambda a, d: torch.zeros_like(a[..., :1]).bool()
     )
-    rows = relabel(make_batch([[3]], terminated=True), reward=reward, k=1)
+    rows = relabel(make_batch([[3]], terminated=True), reward=reward, k=1, achieved_reward=0.0)
     for key in ("terminated", "done"):
         assert not rows["next", key][rows["virtual"]].any()
         assert torch.equal(rows["next", key], ~rows["virtual"] & (rows["observation"][:, :1] == 2))
@@ -275,7 +275,7 @@ def test_a_fall_terminates_virtual_transitions_too(relabel: Relabel, options: di
     """An episode that terminated without success would have done so for any goal."""
     batch = make_batch([[4]], terminated=True)
     batch["next", "reward"].fill_(-1.0)
-    rows = virtual_of(relabel(batch, reward=NEVER, k=2, **options))
+    rows = virtual_of(relabel(batch, reward=NEVER, k=2, achieved_reward=0.0, **options))
     at_end = rows["next", "observation"][:, 0] == 4
     assert at_end.any()
     for key in ("terminated", "done"):
@@ -290,7 +290,7 @@ def test_what_a_fall_cost_is_kept_for_other_goals(relabel: Relabel, options: dic
         rewards = NEVER(batch["next", "achieved_goal"], batch["next", "desired_goal"])[0]
         batch["next", "reward"] = rewards - torch.where(batch["next", "terminated"], cost, 0.0)
         torch.manual_seed(0)
-        drawn.append(virtual_of(relabel(batch, reward=NEVER, k=2, **options)))
+        drawn.append(virtual_of(relabel(batch, reward=NEVER, k=2, achieved_reward=0.0, **options)))
     free, dear = drawn
     assert torch.equal(free["desired_goal"], dear["desired_goal"])
     at_end = free["next", "observation"][:, :1] == 4

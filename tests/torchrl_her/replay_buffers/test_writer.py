@@ -670,7 +670,7 @@ def test_a_success_with_another_reward_is_no_fall() -> None:
     batch = make_batch([[4]], terminated=True)
     batch["next", "reward"] -= 0.1
     batch["next", "desired_goal"][0, 3] = batch["next", "achieved_goal"][0, 3]
-    buffer = make_buffer(reward=dense, k=50)
+    buffer = make_buffer(reward=dense, k=50, achieved_reward=0.0)
     buffer.extend(batch)
     _, virtual = split(buffer)
     reached = virtual["next", "achieved_goal"][:, 0] == virtual["desired_goal"][:, 0]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from torchrl_her.goals.rewards import missed
+from torchrl_her.goals.rewards import achieved_reward_of, missed
 from torchrl_her.replay_buffers.runs.pieces import Chunk
 from torchrl_her.replay_buffers.runs.written import WrittenRows
 
@@ -46,7 +46,7 @@ def count_rows(
         real, virtual: the transitions that are written for the chunk; None without virtual ones.
         relabeled: for each run, the number of real transitions that got goals of their own episode.
     """
-    least = chunk.options.achieved_reward
+    least = achieved_reward_of(chunk.reward_fn, chunk.options.achieved_reward)
     columns = {
         "real": real.counts,
         "relabeled": relabeled,
