@@ -41,6 +41,8 @@ _PIECE = 1 << 26  # bytes between two syncs to disk
 _BODY = len(_MAGIC) + hashlib.sha256().digest_size  # offset at which torch's file starts
 _REMAINING = "_remaining_batches"  # key for the rest of a sampler's pass, which TorchRL's states lack
 _PLAIN = (bool, int, float, str, type(None), torch.Size, torch.dtype)
+# Functions that rebuild the tensors that a safe load accepts: dense ones, not nested, without attributes.
+_DENSE = ("_rebuild_tensor_v2", "_rebuild_tensor_v3", "_rebuild_parameter")
 
 
 class CheckpointError(ValueError):
@@ -84,7 +86,8 @@ def save_checkpoint(state: dict[str, Any], path: str | Path, *, keep: int = 1) -
             before it, and so on.
 
     Raises:
-        TypeError: something in ``state`` is neither a tensor nor plain data, so it could not be loaded.
+        TypeError: something in ``state`` could not be loaded, since it is neither a dense tensor nor plain
+            data; the message names it.
         OSError: the file cannot be written; the previous checkpoint is untouched.
     """
     _check_plain(state, "the state")
@@ -101,11 +104,18 @@ def _check_plain(value: Any, name: str) -> None:
     """Raises a TypeError that names the first entry that a safe load would refuse."""
     if type(value) in (dict, OrderedDict):
         for key, entry in value.items():
+            _check_plain(key, f"the key {key!r} of {name}")
             _check_plain(entry, f"{name}[{key!r}]")
     elif type(value) in (list, tuple):
         for index, entry in enumerate(value):
             _check_plain(entry, f"{name}[{index}]")
-    elif not isinstance(value, Tensor) and type(value) not in _PLAIN:  # numpy's floats pass isinstance
+    elif isinstance(value, Tensor):
+        for tensor in (value, value.data):  # a parameter is rebuilt from its data
+            rebuild = tensor.__reduce_ex__(2)[0].__name__
+            if rebuild not in _DENSE:
+                kind = f"{type(value).__name__} (written as {rebuild})"
+                raise TypeError(f"{name} must be a dense tensor without attributes, got {kind}")
+    elif type(value) not in _PLAIN:  # numpy's floats pass isinstance
         raise TypeError(f"{name} must be a tensor or plain data, got {type(value).__name__} {value!r}")
 
 

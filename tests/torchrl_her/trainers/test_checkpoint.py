@@ -6,6 +6,7 @@ import errno
 import hashlib
 import io
 import os
+import re
 import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
@@ -16,7 +17,8 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tensordict import TensorDict
+from tensordict import MemoryMappedTensor, TensorDict
+from torch import nn
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.data.replay_buffers.samplers import (
@@ -67,6 +69,32 @@ def test_what_could_not_be_loaded_is_not_saved(value: Any, tmp_path: Path) -> No
     with pytest.raises(TypeError, match=said):
         save_checkpoint({"own": [1, value]}, tmp_path / "checkpoint.pt")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("state", "said"),
+    [
+        (torch.eye(2).to_sparse(), "Tensor (written as _rebuild_sparse_tensor)"),
+        (nn.Parameter(torch.eye(2).to_sparse()), "Parameter (written as _rebuild_sparse_tensor)"),
+        (torch.zeros(2, device="meta"), "Tensor (written as _rebuild_meta_tensor_no_storage)"),
+        (MemoryMappedTensor.from_tensor(torch.ones(2)), "MemoryMappedTensor (written as from_handler)"),
+        ({np.int64(1): 2}, "the key np.int64(1) of the state['own'] must be a tensor or plain data"),
+    ],
+)
+def test_tensors_and_keys_that_could_not_be_loaded_leave_the_old_checkpoint(
+    state: Any, said: str, tmp_path: Path
+) -> None:
+    save_checkpoint({"epoch": 1}, tmp_path / "checkpoint.pt")
+    with pytest.raises(TypeError, match=re.escape(said)):
+        save_checkpoint({"own": state}, tmp_path / "checkpoint.pt")
+    assert load_checkpoint(tmp_path / "checkpoint.pt") == {"epoch": 1}
+
+
+def test_parameters_and_rows_of_memory_maps_are_saved(tmp_path: Path) -> None:
+    rows = MemoryMappedTensor.from_tensor(torch.arange(3.0))
+    save_checkpoint([nn.Parameter(torch.ones(2)), rows.data, rows.clone()], tmp_path / "checkpoint.pt")  # type: ignore[arg-type]
+    loaded = load_checkpoint(tmp_path / "checkpoint.pt")
+    assert [own.tolist() for own in loaded] == [[1.0, 1.0], [0.0, 1.0, 2.0], [0.0, 1.0, 2.0]]
 
 
 @pytest.fixture(scope="module")
