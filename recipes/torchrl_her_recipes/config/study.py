@@ -14,7 +14,7 @@ from torchrl_her_recipes.config.plain_files import naming, read_mapping
 from torchrl_her_recipes.config.presets import load_preset
 from torchrl_her_recipes.config.recipe import Recipe, compose
 from torchrl_her_recipes.config.shipped import find_file, shipped_names
-from torchrl_her_recipes.config.shortcuts import locate, merge, place
+from torchrl_her_recipes.config.shortcuts import locate, merge, place, split_name
 
 _LENGTHS = ("num_runs", "epochs", "epoch_frames", "frames")
 _QUICK: dict[str, Any] = {
@@ -252,9 +252,15 @@ def load_study(
 
 
 def _set_in(options: Mapping[str, Any], names: Iterable[str]) -> list[str]:
-    """Returns the short names of the options in ``names`` that ``options`` sets."""
-    places = {locate(name) for name in names}
-    return [name for group, values in place(options).items() for name in values if (group, name) in places]
+    """Returns those of the names of options, or of entries such as ``task.options.bits``, that are set."""
+    placed = place(options)
+
+    def is_set(option: str, *entry: str) -> bool:
+        group, key = locate(option)
+        values = placed.get(group, {})
+        return key in values and all(name in (values[key] or {}) for name in entry)
+
+    return [name for name in names if is_set(*split_name(name))]
 
 
 def _task_of(task: Any) -> Any:

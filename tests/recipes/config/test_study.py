@@ -66,6 +66,18 @@ def test_tasks_may_vary_with_their_options() -> None:
     assert [recipe.run.epochs for _, recipe in study.cells()] == [2, 2]
 
 
+def test_an_option_of_the_task_may_vary_beside_cases_that_set_others() -> None:
+    vary = {"task.options.bits": [4, 5]}
+    cases = {"plain": {}, "short": {"task.options.max_steps": 3}}
+    cells = dict(Study(name="own", recipe={"task": "bit_flip"}, vary=vary, cases=cases).cells())
+    options = [recipe.task.options for recipe in cells.values()]
+    assert options == [{"bits": 4}, {"bits": 4, "max_steps": 3}, {"bits": 5}, {"bits": 5, "max_steps": 3}]
+    with pytest.raises(
+        ValueError, match=r"cases of own must not set task.options.bits in one, since it varies"
+    ):
+        Study(name="own", vary=vary, cases={"one": {"task.options.bits": 6}})
+
+
 def test_cases_are_crossed_with_what_varies_and_not_with_each_other(tmp_path: Path) -> None:
     path = tmp_path / "own.yaml"
     path.write_text(

@@ -24,7 +24,16 @@ _KINDS = {"float": _RANGE, "log_float": _RANGE, "int": _RANGE, "log_int": _RANGE
 _MOST = 100  # largest number of values in a range of kind "choice"
 _LARGEST = 1e15
 # Options that cannot vary: trials must have the same length and start to be compared.
-_SAME_FOR_ALL = ("task", "seed", "num_runs", "epochs", "epoch_frames", "checkpoint_interval", "keep_buffer")
+_SAME_FOR_ALL = (
+    "task",
+    "seed",
+    "num_runs",
+    "epochs",
+    "frames",
+    "epoch_frames",
+    "checkpoint_interval",
+    "keep_buffer",
+)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -137,6 +137,7 @@ def test_a_space_is_what_was_written(tmp_path: Path) -> None:
         ("k: {kind: choice, low: 3, high: 4}", "k of kind choice must have values, got"),
         ("seed: {kind: int, low: 1, high: 8}", "seed must be the same in all trials of a search"),
         ("task: {kind: choice, values: [hand_v0, hand_v1]}", "task must be the same in all trials"),
+        ("frames: {kind: int, low: 1000, high: 2000}", "frames must be the same in all trials"),
         (
             "gamma: {kind: float, low: 0.1, high: 0.9}\nlearner.gamma: {kind: float, low: 0.1, high: 0.9}",
             "two entries for gamma",
