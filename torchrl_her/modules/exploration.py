@@ -12,7 +12,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, exploration_type
 
-from torchrl_her.checks import check_whole
+from torchrl_her.checks import check_finite, check_whole
 
 
 def explore(
@@ -171,7 +171,8 @@ class DecayingEpsilon(Exploration):
         **options: options of :class:`~torchrl_her.modules.Exploration`.
 
     Raises:
-        ValueError: ``noise`` is negative or ``uniform_share`` outside of [0, 1].
+        ValueError: ``noise`` is negative, ``uniform_share`` is outside of [0, 1], or the actions' bounds are
+            not finite or ``low`` is above ``high``.
 
     Example:
         >>> exploration = DecayingEpsilon(-torch.ones(3), torch.ones(3), start=1.0, decay=0.5)
@@ -187,6 +188,9 @@ class DecayingEpsilon(Exploration):
             raise ValueError(f"noise must be at least 0 and finite, got {noise}")
         if not 0.0 <= uniform_share <= 1.0:
             raise ValueError(f"uniform_share must be in [0, 1], got {uniform_share}")
+        check_finite({"low": low, "high": high})
+        if bool((wrong := low > high).any()):
+            raise ValueError(f"low must be at most high={high[wrong][0].item()}, got {low[wrong][0].item()}")
         super().__init__(**options)
         self.noise, self.uniform_share = noise, uniform_share
         self.register_buffer("low", low.clone())

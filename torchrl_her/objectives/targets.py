@@ -15,6 +15,8 @@ from torchrl.objectives import HardUpdate, LossModule, SoftUpdate
 from torchrl.objectives.utils import TargetNetUpdater
 from torchrl.objectives.value import TD0Estimator
 
+from torchrl_her.checks import check_whole
+
 
 class ClampedTD0(TD0Estimator):
     """Targets of one or several steps, clamped to the values that are possible.
@@ -180,12 +182,20 @@ def make_target_updater(
         hard_interval: number of steps after which the online weights are copied; 0 for soft updates.
         runs: number of independent runs in the loss; each has its own count of steps.
 
+    Raises:
+        ValueError: ``hard_interval`` or ``runs`` is not whole or too small, or ``tau`` is outside of (0, 1]
+            in soft updates.
+
     Example:
         >>> from torchrl_her import make_actor, make_critic, make_ddpg_loss
         >>> loss = make_ddpg_loss(make_actor((9, 2), 3), make_critic((9, 2), 3))
         >>> isinstance(make_target_updater(loss, tau=0.01, hard_interval=0), SoftUpdate)
         True
     """
+    check_whole(hard_interval=hard_interval, least=0)
+    check_whole(runs=runs)
     if hard_interval > 0:
         return RunsHardUpdate(loss, interval=hard_interval, runs=runs)
+    if not 0.0 < tau <= 1.0:
+        raise ValueError(f"tau must be in (0, 1] in soft updates, got {tau}")
     return BuffersSoftUpdate(loss, tau=tau)

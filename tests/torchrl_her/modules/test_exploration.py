@@ -192,6 +192,21 @@ def test_bad_options_are_named(options: dict[str, float], message: str) -> None:
         make_module(**options)
 
 
+@pytest.mark.parametrize(
+    ("low", "high", "message"),
+    [
+        ([0.0, 0.0], [1.0, math.inf], "high must be finite, got inf in it"),
+        ([0.0, math.nan], [1.0, 1.0], "low must be finite, got nan in it"),
+        ([0.0, 2.0], [1.0, 1.0], "low must be at most high=1.0, got 2.0"),
+    ],
+)
+def test_bounds_without_actions_between_them_are_named(
+    low: list[float], high: list[float], message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        DecayingEpsilon(torch.tensor(low), torch.tensor(high))
+
+
 def test_behind_an_actor_in_a_collector() -> None:
     env = make_env("hand_reach", num_envs=20, seed=0)
     actor, module = make_actor((5, 2), 3), make_module(start=0.5)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
 from torch import Tensor
@@ -120,6 +122,21 @@ def test_targets_are_copied_every_so_many_steps(interval: int) -> None:
 def test_kinds_of_target_updates() -> None:
     assert isinstance(make_target_updater(make_loss(), tau=0.1, hard_interval=0), SoftUpdate)
     assert isinstance(make_target_updater(make_loss(), tau=0.1, hard_interval=5), HardUpdate)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"tau": 0.0}, r"tau must be in \(0, 1\] in soft updates, got 0.0"),
+        ({"tau": 1.5}, r"tau must be in \(0, 1\] in soft updates, got 1.5"),
+        ({"hard_interval": 2.5}, "hard_interval must be a whole number, got 2.5"),
+        ({"hard_interval": -10}, "hard_interval must be at least 0, got -10"),
+        ({"hard_interval": 5, "runs": 0}, "runs must be at least 1, got 0"),
+    ],
+)
+def test_numbers_that_would_never_move_a_target_are_named(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make_target_updater(make_loss(), **{"tau": 0.5, "hard_interval": 0} | options)
 
 
 # Batch normalization
