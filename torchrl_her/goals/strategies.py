@@ -32,6 +32,8 @@ def episode(time: Tensor, lengths: Tensor) -> tuple[Tensor, Tensor]:
 STRATEGIES: dict[str, StrategyFunction] = {"future": future, "final": final, "episode": episode}
 _SAFE = tuple(STRATEGIES.values())  # these never leave the episode, so their candidates are not checked
 
+_INTEGERS = (torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8)
+
 # Sources that are no strategies, since they take goals of other episodes: see ``check_goal_sources``.
 RECENT = ("actual", "achieved")
 
@@ -120,8 +122,8 @@ def candidate_range(strategy: Strategy, time: Tensor, lengths: Tensor) -> tuple[
         ``(first, end)``, [...] each: the candidates are ``first <= t' < end``.
 
     Raises:
-        ValueError: the strategy is unknown, or its function gives a transition no candidate, or one
-            outside of its episode.
+        ValueError: the strategy is unknown, or its function returns anything but two tensors of whole
+            numbers, or gives a transition no candidate, or one outside of its episode.
 
     Example:
         >>> first, end = candidate_range("future", torch.tensor([0, 1]), torch.tensor(2))
@@ -132,6 +134,12 @@ def candidate_range(strategy: Strategy, time: Tensor, lengths: Tensor) -> tuple[
     time, lengths = torch.broadcast_tensors(time, lengths)
     first, end = function(time, lengths)
     if not any(function is safe for safe in _SAFE):
+        kinds = [getattr(edge, "dtype", edge) for edge in (first, end)]
+        if not all(kind in _INTEGERS for kind in kinds):
+            raise ValueError(
+                f"goal strategy {strategy_name(strategy)!r} must return two int64 tensors, first and end, "
+                f"got {kinds[0]} and {kinds[1]}"
+            )
         first, end, _ = torch.broadcast_tensors(first, end, time)
         wrong = (time < lengths) & ((first < 0) | (first >= end) | (end > lengths))  # padding is ignored
         if bool(wrong.any()):

@@ -30,6 +30,9 @@ def find_streams(data: TensorDictBase, keys: TransitionKeys) -> tuple[str, Tenso
     Returns:
         ``(kind, streams)``: how streams were found, and the stream of each transition, int64, flat.
 
+    Raises:
+        ValueError: environment ids are not one whole number for each transition.
+
     Example:
         >>> from tensordict import TensorDict
         >>> from torchrl_her import HindsightOptions
@@ -38,6 +41,12 @@ def find_streams(data: TensorDictBase, keys: TransitionKeys) -> tuple[str, Tenso
         ('places in the batch', [0, 0, 0, 1, 1, 1])
     """
     if (envs := data.get(keys.env_ids, None)) is not None:
+        if envs.numel() != data.numel() or envs.is_floating_point():
+            raise ValueError(
+                f"ids of environments ({keys.env_ids!r}) must be one whole number for each transition, got "
+                f"{envs.dtype} of shape {list(envs.shape)}: use another env_ids_key if that entry is "
+                "something else"
+            )
         return BY_ENV, envs.reshape(-1)
     if data.ndim == 1 and (trajectory := data.get(keys.trajectory, None)) is not None:
         return BY_TRAJECTORY, trajectory.reshape(-1)

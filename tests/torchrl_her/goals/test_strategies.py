@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 import torch
@@ -88,6 +89,23 @@ def test_a_strategy_that_leaves_the_episode_is_named(shift: tuple[int, int], mes
 
     with pytest.raises(ValueError, match=f"goal strategy 'astray' gives .*{message}"):
         candidate_range(astray, torch.arange(3), torch.tensor(3))
+
+
+@pytest.mark.parametrize(
+    ("first", "got"),
+    [
+        (torch.zeros(3), "torch.float32 and torch.int64"),
+        (torch.zeros(3, dtype=torch.bool), "torch.bool and torch.int64"),
+        (0, "0 and torch.int64"),
+    ],
+)
+def test_a_strategy_that_returns_no_steps_is_named(first: Any, got: str) -> None:
+    def rounded(_time: Tensor, lengths: Tensor) -> tuple[Tensor, Tensor]:
+        return first, lengths
+
+    message = f"goal strategy 'rounded' must return two int64 tensors, first and end, got {got}$"
+    with pytest.raises(ValueError, match=message):
+        candidate_range(rounded, torch.arange(3), torch.tensor(3))
 
 
 def test_functions_are_sources_too() -> None:

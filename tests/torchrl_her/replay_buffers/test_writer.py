@@ -488,6 +488,22 @@ def test_the_values_of_environment_ids_do_not_matter() -> None:
     assert all(torch.equal(stored[0][key], stored[1][key]) for key in stored[0].keys(True, True))
 
 
+@pytest.mark.parametrize(
+    ("ids", "got"),
+    [
+        (torch.zeros(1, 5, 3, dtype=torch.int64), r"torch.int64 of shape \[1, 5, 3\]"),
+        (torch.zeros(1, 5, 1), r"torch.float32 of shape \[1, 5, 1\]"),
+    ],
+)
+def test_an_entry_that_holds_no_environment_ids_is_named(ids: Tensor, got: str) -> None:
+    message = (
+        rf"\('env_ids'\) must be one whole number for each transition, got {got}: use another env_ids_key"
+    )
+    with pytest.raises(ValueError, match=message):
+        make_buffer().extend(make_batch([[5]]).set("env_ids", ids))
+    make_buffer(env_ids_key="who").extend(make_batch([[5]]).set("env_ids", ids))
+
+
 def test_ids_that_are_used_again_join_no_episodes() -> None:
     first = make_batch([[9]], steps=3).squeeze(0)
     again = make_batch([[9, 4]], first=[(1, 0)], steps=4).squeeze(0)
