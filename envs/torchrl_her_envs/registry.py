@@ -53,6 +53,7 @@ class TaskSpec:
 
 
 _SPECS: dict[str, TaskSpec] = {}
+_BUILT_IN: tuple[str, ...] = ()  # names of this package's tasks
 
 
 def register_task(spec: TaskSpec) -> None:
@@ -62,14 +63,15 @@ def register_task(spec: TaskSpec) -> None:
         spec: description of the task.
 
     Raises:
-        ValueError: the name is taken or has a colon, or ``make`` is not of the form ``"module:name"``.
+        ValueError: the name has a colon, or is that of a task of this package or of one with another
+            ``make``, or ``make`` is not of the form ``"module:name"``.
 
     Example:
         >>> register_task(get_task_spec("chain"))
         Traceback (most recent call last):
         ValueError: the task 'chain' is registered already
     """
-    if spec.name in _SPECS:
+    if spec.name in _BUILT_IN or _SPECS.get(spec.name, spec).make != spec.make:
         raise ValueError(f"the task {spec.name!r} is registered already")
     if not spec.name or ":" in spec.name:
         raise ValueError(f"a task's name must be some text without a colon, got {spec.name!r}")
@@ -268,3 +270,4 @@ for _spec in (
     ),
 ):
     register_task(_spec)
+_BUILT_IN = tuple(_SPECS)

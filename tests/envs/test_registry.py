@@ -194,6 +194,16 @@ def test_a_task_that_is_registered_can_be_made(own_tasks: None, monkeypatch: pyt
         check_task("owm")
 
 
+def test_a_task_that_is_registered_again_replaces_itself(own_tasks: None) -> None:
+    register_task(own_spec())
+    register_task(own_spec(summary="as it is now"))
+    assert get_task_spec("own").summary == "as it is now"
+    with pytest.raises(ValueError, match="the task 'own' is registered already"):
+        register_task(own_spec(make="another_module:make_own"))
+    with pytest.raises(ValueError, match="the task 'hand_v0' is registered already"):
+        register_task(get_task_spec("hand_v0"))
+
+
 def test_a_task_without_options_says_so(own_tasks: None) -> None:
     with pytest.raises(ValueError, match="own takes no option 'size'; it has none"):
         check_options(own_spec(options={}), {"size": 1})

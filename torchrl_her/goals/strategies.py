@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from difflib import get_close_matches
 from numbers import Integral
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -44,13 +45,14 @@ def register_strategy(name: str, function: StrategyFunction) -> None:
     A function can also be used without a name: ``HERWriter(reward_fn, strategy=function)``.
 
     Args:
-        name: name of the strategy, not yet taken.
+        name: name of the strategy, not yet taken by another one.
         function: maps the steps of transitions and the lengths of their episodes, both [...] int64, to
             ``(first, end)``, both [...] int64: the candidates are the transitions ``first <= t' < end``.
             There must be at least one, and all must lie within the episode.
 
     Raises:
-        ValueError: the name is taken or empty.
+        ValueError: the name is empty, or taken by a function of another module or qualified name; a function
+            that is defined again, as in a notebook, replaces the one before.
         TypeError: the function cannot be called.
 
     Example:
@@ -63,12 +65,17 @@ def register_strategy(name: str, function: StrategyFunction) -> None:
     """
     if not name:
         raise ValueError(f"a goal strategy needs a name, got {name!r}")
-    if name in STRATEGIES or name in RECENT:
+    if name in RECENT or _place_of(STRATEGIES.get(name, function)) != _place_of(function):
         names = ", ".join([*STRATEGIES, *RECENT])
         raise ValueError(f"the name {name!r} is taken by another goal strategy; taken are {names}")
     if not callable(function):
         raise TypeError(f"goal strategy {name!r} must be a function, got {function!r}")
     STRATEGIES[name] = function
+
+
+def _place_of(function: StrategyFunction) -> tuple[Any, Any]:
+    """Returns module and qualified name, which a function keeps if its module or cell runs again."""
+    return getattr(function, "__module__", None), getattr(function, "__qualname__", function)
 
 
 def get_strategy(strategy: Strategy) -> StrategyFunction:

@@ -78,9 +78,9 @@ def register_algorithm(algorithm: Algorithm) -> None:
     """Registers an algorithm by its name.
 
     Raises:
-        ValueError: the name is taken.
+        ValueError: the name is taken by an algorithm that is not equal.
     """
-    if algorithm.name in ALGORITHMS:
+    if ALGORITHMS.get(algorithm.name, algorithm) != algorithm:
         raise ValueError(f"there is an algorithm {algorithm.name!r} already")
     ALGORITHMS[algorithm.name] = algorithm
 

@@ -38,9 +38,9 @@ def register_logger(spec: LoggerSpec) -> None:
     """Registers a logger by its name.
 
     Raises:
-        ValueError: the name is taken.
+        ValueError: the name is taken by a logger with another factory.
     """
-    if spec.name in LOGGERS:
+    if LOGGERS.get(spec.name, spec).factory != spec.factory:
         raise ValueError(f"there is a logger {spec.name!r} already")
     LOGGERS[spec.name] = spec
 

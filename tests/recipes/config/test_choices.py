@@ -8,6 +8,8 @@ import pytest
 
 from torchrl_her_recipes import BEHAVIOR, Proposed, Recipe, build, make_recipe, option
 from torchrl_her_recipes.cli import main
+from torchrl_her_recipes.config import algorithms
+from torchrl_her_recipes.config.algorithms import Algorithm, register_algorithm
 from torchrl_her_recipes.config.choices.behavior import Behavior, Mega, Real
 from torchrl_her_recipes.config.choices.kind import Kind
 from torchrl_her_recipes.config.shortcuts import KINDS
@@ -38,7 +40,27 @@ def test_a_name_is_taken_once() -> None:
     kind = Kind("behavior", Behavior, default="real")
     assert kind.register(Real) is Real
     with pytest.raises(ValueError, match="behavior=real is registered already"):
-        kind.register(Real)
+        kind.register(type("Real", (Real,), {}))
+    with pytest.raises(ValueError, match="behavior=real is registered already"):
+        kind.register(type("Other", (Real,), {"__module__": Real.__module__}))
+    assert kind["real"] is Real
+
+
+def test_a_class_that_is_defined_again_replaces_itself() -> None:
+    kind = Kind("behavior", Behavior, default="real")
+    kind.register(Real)
+    again = type("Real", (Behavior,), {"name": "real", "__module__": Real.__module__})
+    assert kind.register(again) is again
+    assert kind["real"] is again
+
+
+def test_an_algorithm_is_registered_again_if_it_is_equal(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(algorithms, "ALGORITHMS", dict(algorithms.ALGORITHMS))
+    for _ in range(2):
+        register_algorithm(Algorithm("her_right", filter=True, weights="right"))
+    for name in ("her_right", "her"):
+        with pytest.raises(ValueError, match=f"there is an algorithm '{name}' already"):
+            register_algorithm(Algorithm(name, weights="right"))
 
 
 def test_a_name_that_resembles_no_other_may_be_one_of_a_module() -> None:

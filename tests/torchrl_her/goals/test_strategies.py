@@ -66,13 +66,28 @@ def test_a_function_may_give_one_number_for_all() -> None:
 def test_names_are_given_once(registered: str) -> None:
     for name in ("future", registered):
         with pytest.raises(ValueError, match=f"the name '{name}' is taken"):
-            register_strategy(name, at_most_two_steps)
-    assert get_strategy("future") is not at_most_two_steps
+            register_strategy(name, lambda time, lengths: (time, lengths))
+    assert get_strategy("future")(torch.tensor(0), torch.tensor(2)) == (0, 2)
+    assert get_strategy(registered) is at_most_two_steps
+    with pytest.raises(ValueError, match="the name 'future' is taken"):
+        register_strategy("future", at_most_two_steps)
     with pytest.raises(ValueError, match="needs a name, got ''"):
         register_strategy("", at_most_two_steps)
     with pytest.raises(TypeError, match="goal strategy 'none' must be a function, got 7"):
         register_strategy("none", 7)  # type: ignore[arg-type]
     assert "none" not in STRATEGIES
+
+
+def test_a_function_that_is_defined_again_replaces_itself(registered: str) -> None:
+    cell = "def at_most_two_steps(time, lengths):\n    return time, lengths"
+    again: dict[str, Any] = {"__name__": __name__}
+    exec(cell, again)
+    register_strategy(registered, again["at_most_two_steps"])
+    assert get_strategy(registered) is again["at_most_two_steps"]
+    elsewhere: dict[str, Any] = {"__name__": "another_module"}
+    exec(cell, elsewhere)
+    with pytest.raises(ValueError, match="the name 'at_most_two_steps' is taken"):
+        register_strategy(registered, elsewhere["at_most_two_steps"])
 
 
 @pytest.mark.parametrize(

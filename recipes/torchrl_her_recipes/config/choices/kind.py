@@ -49,8 +49,9 @@ class Kind(dict[str, type[C]]):
         return choice(**values)
 
     def register(self, choice: type[C]) -> type[C]:
-        """Class decorator that registers a choice under its ``name``."""
-        if choice.name in self:
+        """Class decorator that registers a choice under its ``name``, also when its module runs again."""
+        before = self.get(choice.name, choice)
+        if (before.__module__, before.__qualname__) != (choice.__module__, choice.__qualname__):
             raise ValueError(f"{self.section}={choice.name} is registered already")
         self[choice.name] = choice
         return choice

@@ -196,6 +196,9 @@ def test_a_logger_whose_package_is_missing_names_the_extra(monkeypatch: pytest.M
         check_installed(("tensorboard", "other"))
     with pytest.raises(ValueError, match="there is a logger 'tensorboard' already"):
         register_logger(LoggerSpec(name="tensorboard", factory="x:y"))
+    register_logger(spec)  # as a cell that runs again
+    with pytest.raises(ValueError, match="there is a logger 'other' already"):
+        register_logger(LoggerSpec(name="other", factory="z:y"))
 
 
 @pytest.mark.parametrize("name", ["runs/plots.py", "reports/pictures.py"])
