@@ -58,6 +58,7 @@ def notices(rows: Sequence[Row], recipe: Recipe, bounds: tuple[float, float]) ->
         runs.setdefault(row["run"], []).append(row)
     task, learner = recipe.task.name, recipe.learner
     rules = [  # each takes the rows of a run, and returns a message if they show its problem
+        partial(_no_update, recipe),
         partial(_nothing_achieved, task),
         partial(_nothing_to_relabel, task, recipe.hindsight.algorithm),
         partial(_saturated, learner),
@@ -80,6 +81,16 @@ def notices(rows: Sequence[Row], recipe: Recipe, bounds: tuple[float, float]) ->
 
 def _success(row: Row) -> float:
     return row.get("stage_success", row["success"])  # in a curriculum, success at the current stage's goals
+
+
+def _no_update(recipe: Recipe, rows: Sequence[Row]) -> str | None:
+    warmup = recipe.collection.warmup_frames
+    if rows[-1].get("updates", 1) or recipe.total_frames >= warmup:
+        return None
+    return (
+        f"the run ends after {recipe.total_frames:,} environment steps, before its first gradient step. What "
+        f"helps: warmup_frames below {warmup:,}, or more frames"
+    )
 
 
 def _nothing_achieved(task: str, rows: Sequence[Row]) -> str | None:

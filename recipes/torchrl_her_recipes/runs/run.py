@@ -107,9 +107,7 @@ def run(
             check_installed(components.recipe.run.log)
             current.home.create()
             stack.enter_context(current.home.at_work())
-            # The checkpoint is written before config.yaml, so that a folder with config.yaml can be resumed.
             current.save(current.home, goals=False)
-            current.home.describe(components.recipe)
         return current.train(callbacks, progress=progress)
 
 
@@ -274,8 +272,9 @@ class _Run:
                     if home is not None:
                         with self._despite_a_full_disk("table"):
                             home.write_table(rows)
+                        due = trainer.epochs % recipe.run.checkpoint_interval == 0
+                        saved = (due or not home.config.exists()) and self.save(home)
                         self.save_best(home)
-                        saved = trainer.epochs % recipe.run.checkpoint_interval == 0 and self.save(home)
             except Interrupted:
                 interrupted, saved = True, False
             except Stopped:
@@ -288,6 +287,7 @@ class _Run:
             if home is not None:
                 if not saved:
                     self.save(home)
+                    self.save_best(home)
                 self.finish(home)
             for hook in hooks:
                 hook.on_end(view)
@@ -340,6 +340,9 @@ class _Run:
         state = run_state(self.parts, buffer=self.recipe.run.keep_buffer or not self.has_ended)
         with self._despite_a_full_disk("checkpoint"):
             save_checkpoint(state, home.checkpoint, keep=self.recipe.run.keep_checkpoints)
+            if not home.config.exists():  # written last, so that a folder with config.yaml can be resumed
+                home.describe(self.recipe)
+                self.best.is_new = self.best.state is not None
             return True
         return False
 

@@ -176,6 +176,13 @@ def test_a_run_says_that_its_actions_are_at_their_bounds(
     assert (pd.read_csv(tmp_path / "run" / "metrics.csv")["saturation"] >= 0.95).all()
 
 
+def test_a_run_that_is_too_short_to_learn_says_so() -> None:
+    rows, length = table(3, updates=0), {"epochs": 3, "epoch_frames": 100}
+    line = only(rows, after=1, warmup_frames=400, **length)
+    assert "ends after 300 environment steps, before its first gradient step" in line
+    assert not any(said(rows, warmup_frames=300, **length))
+
+
 def test_a_run_says_that_its_critic_diverges(capsys: pytest.CaptureFixture[str]) -> None:
     wild = {"learner": "td3", "learning_rate": 10.0, "max_grad_norm": 1e9, "clamp_targets": False, "tau": 0.5}
     run(build(small(epochs=4, epoch_frames=800, hidden=8, norm="none", **wild)))
@@ -185,6 +192,7 @@ def test_a_run_says_that_its_critic_diverges(capsys: pytest.CaptureFixture[str])
 def test_the_page_about_them_has_each_of_them() -> None:
     page = PAGE.read_text()
     for words in (
+        "before its first gradient step",
         "no goal has been achieved",
         "the filter has left",
         "of the virtual goals were achieved before the action",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from shutil import rmtree
 from typing import Any
 
 import pandas as pd
@@ -12,7 +13,8 @@ import torch
 import yaml
 from PIL import Image
 
-from torchrl_her_recipes import Components, Recipe, build, load_policy, resume, run
+from torchrl_her_recipes import Callback, Components, Recipe, RunView, build, load_policy, resume, run
+from torchrl_her_recipes.runs.folder import RunFolder
 
 from ..small import assert_same, small
 
@@ -90,6 +92,22 @@ def test_the_same_seed_gives_the_same_run() -> None:
     first, second, other = (everything(components) for components in runs)
     assert_same(first, second)
     assert not all(torch.equal(first[name], other[name]) for name in first)
+
+
+def test_a_folder_that_is_deleted_meanwhile_is_written_anew(tmp_path: Path) -> None:
+    class Delete(Callback):
+        def on_epoch(self, run: RunView) -> bool:
+            if run.trainer.epochs == 1:
+                rmtree(tmp_path / "run")
+            return False
+
+    recipe = small(algo="her", epochs=2, checkpoint_interval=9)
+    run(build(recipe), tmp_path / "run", callbacks=[Delete()], progress=False)
+    assert RunFolder(tmp_path / "run").recipe() == recipe
+    assert [row["epoch"] for row in RunFolder(tmp_path / "run").rows()] == [1, 2]
+    assert json.loads((tmp_path / "run" / "run.json").read_text())["best"]["epoch"] >= 1
+    load_policy(tmp_path / "run", best=True)
+    assert not resume(tmp_path / "run", progress=False).interrupted
 
 
 def test_epochs_without_an_update_leave_a_table_that_fits(tmp_path: Path) -> None:
