@@ -84,12 +84,12 @@ def _success(row: Row) -> float:
 
 
 def _no_update(recipe: Recipe, rows: Sequence[Row]) -> str | None:
-    warmup = recipe.collection.warmup_frames
-    if rows[-1].get("updates", 1) or recipe.total_frames >= warmup:
+    row = rows[-1]
+    if row.get("updates", 1) or row["epoch"] < recipe.run.epochs:  # the last epoch may end after the warm-up
         return None
     return (
-        f"the run ends after {recipe.total_frames:,} environment steps, before its first gradient step. What "
-        f"helps: warmup_frames below {warmup:,}, or more frames"
+        f"the run ends after {row['frames']:,.0f} environment steps, before its first gradient step. What "
+        f"helps: warmup_frames below {recipe.collection.warmup_frames:,}, or more frames"
     )
 
 
