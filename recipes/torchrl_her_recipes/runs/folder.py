@@ -161,8 +161,7 @@ class RunFolder:
         return bool(rows) and rows[-1]["epoch"] >= self.recipe().run.epochs
 
     def write_table(self, rows: Sequence[dict[str, float]]) -> None:
-        """Writes the table of metrics to ``metrics.csv``, in a new folder if it was deleted meanwhile."""
-        self.path.mkdir(parents=True, exist_ok=True)
+        """Writes the table of metrics to ``metrics.csv``."""
         columns = list(dict.fromkeys(name for row in rows for name in row))
         with written(self.metrics) as part, open(part, "w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, columns, restval="nan")

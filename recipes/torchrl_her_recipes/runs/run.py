@@ -341,6 +341,8 @@ class _Run:
         with self._despite_a_full_disk("checkpoint"):
             save_checkpoint(state, home.checkpoint, keep=self.recipe.run.keep_checkpoints)
             if not home.config.exists():  # written last, so that a folder with config.yaml can be resumed
+                if self.rows:
+                    home.write_table(self.rows)
                 home.describe(self.recipe)
                 self.best.is_new = self.best.state is not None
             return True
@@ -368,6 +370,8 @@ class _Run:
     def _despite_a_full_disk(self, what: str) -> Iterator[None]:
         """Turns a failure to write a file into a warning, since the next epoch tries again."""
         try:
+            if self.home is not None:
+                self.home.path.mkdir(parents=True, exist_ok=True)  # it may have been deleted meanwhile
             yield
         except OSError as error:
             message = f"no {what} after {self.trainer.frames:,} frames, the run continues: {error}"

@@ -110,6 +110,19 @@ def test_a_folder_that_is_deleted_meanwhile_is_written_anew(tmp_path: Path) -> N
     assert not resume(tmp_path / "run", progress=False).interrupted
 
 
+def test_a_run_that_stops_when_its_folder_was_deleted_can_be_resumed(tmp_path: Path) -> None:
+    class DeleteAndStop(Callback):
+        def on_batch(self, run: RunView) -> bool:
+            if run.trainer.epochs == 1:
+                rmtree(tmp_path / "run")
+            return run.trainer.epochs == 1
+
+    recipe = small(algo="her", epochs=2)
+    run(build(recipe), tmp_path / "run", callbacks=[DeleteAndStop()], progress=False)
+    assert RunFolder(tmp_path / "run").recipe() == recipe
+    assert [row["epoch"] for row in resume(tmp_path / "run", progress=False).rows] == [1, 2]
+
+
 def test_epochs_without_an_update_leave_a_table_that_fits(tmp_path: Path) -> None:
     recipe = small(epochs=3, epoch_frames=400, warmup_frames=900, checkpoint_interval=1, pictures=True)
     run(build(recipe), tmp_path / "run", progress=False)
