@@ -63,8 +63,9 @@ def achieved(achieved_goal: Tensor, desired_goal: Tensor, threshold: float) -> T
     Returns:
         Mask [...] of achieved goals.
     """
-    if (widths := [goal.shape[-1] for goal in (achieved_goal, desired_goal)])[0] != widths[1]:
-        raise ValueError(f"goals must have one width, got {widths[0]} and {widths[1]}")
+    width, wanted = achieved_goal.shape[-1], desired_goal.shape[-1]
+    if width != wanted:
+        raise ValueError(f"goals must have one width, got {width} and {wanted}")
     if achieved_goal.dtype not in (torch.float32, torch.float64):  # squares of int8 overflow, for example
         achieved_goal, desired_goal = achieved_goal.double(), desired_goal.double()
     # Coordinates are added one by one: torch takes several times as long to sum over a short dimension.

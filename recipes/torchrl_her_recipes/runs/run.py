@@ -368,7 +368,7 @@ class _Run:
 
     @contextmanager
     def _despite_a_full_disk(self, what: str) -> Iterator[None]:
-        """Turns a failure to write a file into a warning, since the next epoch tries again."""
+        """Makes the folder if it is missing; turns a failure to write into a warning, as epochs try again."""
         try:
             if self.home is not None:
                 self.home.path.mkdir(parents=True, exist_ok=True)  # it may have been deleted meanwhile
