@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -88,6 +89,11 @@ class _Loader(yaml.SafeLoader):
         return node
 
 
+# Numbers such as 1e-3, which YAML 1.1 reads as text unless they are written 1.0e-3.
+_SHORT_FLOAT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$")
+_Loader.add_implicit_resolver("tag:yaml.org,2002:float", _SHORT_FLOAT, list("-+.0123456789"))
+
+
 def parse_yaml(text: str) -> Any:
     """Parses YAML text into plain values.
 
@@ -95,8 +101,8 @@ def parse_yaml(text: str) -> Any:
         ValueError: the text is not YAML, or has an alias (``*name``).
 
     Example:
-        >>> parse_yaml("{a: [1, b]}")
-        {'a': [1, 'b']}
+        >>> parse_yaml("{a: [1, b, 1e-3]}")
+        {'a': [1, 'b', 0.001]}
         >>> parse_yaml("a: &a [1, *a]")
         Traceback (most recent call last):
         ValueError: it has an alias (*name); write the value in full

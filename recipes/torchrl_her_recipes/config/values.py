@@ -13,7 +13,7 @@ from torchrl_her_recipes.config.plain_files import shown
 def as_kind(name: str, value: object, kind: type) -> Any:
     """Converts a value to the type of an option.
 
-    YAML reads ``1e-3`` as text, so text that spells a number is accepted for an option that is a number.
+    Text that spells a number is accepted for an option that is a number.
 
     Example:
         >>> as_kind("learning_rate", "1e-3", float), as_kind("epochs", 2.0, int)

@@ -21,6 +21,8 @@ from torchrl_her_recipes.cli.overrides import parse_overrides, parse_value, spli
         ("{bits: 8}", {"bits": 8}),
         ("gym:FetchReach-v4", "gym:FetchReach-v4"),
         ("/a/b=c", "/a/b=c"),
+        ("[1e-3, -2.5E+1, .5e0]", [0.001, -25.0, 0.5]),
+        ("[1e, e1, 1e-3m]", ["1e", "e1", "1e-3m"]),
     ],
 )
 def test_values_are_read_as_yaml(text: str, value: Any) -> None:
