@@ -112,6 +112,12 @@ class PackedStorage(LazyTensorStorage):
         if self.packed is None:
             self._pack()
 
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)
+        if self._packed is not None and self.packed is not None:
+            # The entries of a copy have memory of their own, so they are made views of the packed rows again.
+            self._storage = self._views = unpack(self._packed, self.fields)
+
     def restore(self, begin: int, packed: Tensor, fields: Sequence[Field]) -> bool:
         """Copies packed rows [n, m] to ``begin``; returns False if this storage has another layout."""
         if not self.initialized:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import pickle
 from collections.abc import Callable
+from copy import deepcopy
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -104,8 +105,17 @@ def test_states_and_files_are_torchrl_s(kind: type, tmp_path: Path) -> None:
     other = filled(PackedStorage, make_rows(12, seed=1))
     other.loads(tmp_path / "storage")
     assert same(other.get(torch.arange(12)), rows)
-    copy = pickle.loads(pickle.dumps(filled(PackedStorage, rows)))
-    assert same(copy.get(torch.arange(12)), rows)
+
+
+@pytest.mark.parametrize("copy", [deepcopy, lambda storage: pickle.loads(pickle.dumps(storage))])
+def test_copies_keep_what_is_written_to_them(copy: Callable[[PackedStorage], PackedStorage]) -> None:
+    rows = make_rows(12)
+    source = filled(PackedStorage, rows)
+    other = copy(source)
+    assert same(other.get(torch.arange(12)), rows)
+    other.set(slice(0, 2), make_rows(2, seed=1))
+    assert same(other.get(torch.arange(2)), make_rows(2, seed=1))
+    assert same(source.get(torch.arange(12)), rows)
 
 
 def test_what_cannot_be_packed_is_kept_as_torchrl_does() -> None:
