@@ -73,6 +73,8 @@ class _BlockSampler(StateFile, Sampler):
     def _check_state(self, state_dict: dict[str, Any]) -> None:
         if len(state_dict["sizes"]) != self.runs:
             raise ValueError(f"the state must have {self.runs} runs, got {len(state_dict['sizes'])}")
+        if (most := int(state_dict["sizes"].max())) > self.capacity:
+            raise ValueError(f"the state must have at most {self.capacity:,} rows of each run, got {most:,}")
 
 
 class RunsSampler(_BlockSampler):

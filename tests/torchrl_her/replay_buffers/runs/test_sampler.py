@@ -171,6 +171,14 @@ def test_a_file_brings_the_same_draws_back(kind: str, tmp_path: Path) -> None:
 
 
 @BOTH
+def test_the_state_of_a_larger_buffer_is_refused(kind: str) -> None:
+    sampler = make(kind)
+    state = {**sampler.state_dict(), "sizes": torch.tensor([CAPACITY, CAPACITY + 1, 0])}
+    with pytest.raises(ValueError, match="the state must have at most 40 rows of each run, got 41"):
+        sampler.load_state_dict(state)
+
+
+@BOTH
 def test_what_cannot_be_is_refused(kind: str) -> None:
     with pytest.raises(ValueError, match="runs must be at least 1, got 0"):
         make(kind, 0, generators=None)
