@@ -99,7 +99,7 @@ class _BuffersToo(TargetNetUpdater):
             name: [
                 key
                 for key, entry in getattr(self.loss_module, name).items(True, True)
-                if not entry.requires_grad
+                if not entry.requires_grad and entry.is_floating_point()  # others count, as batches
             ]
             for name in self._source_names
         }
@@ -155,6 +155,9 @@ class RunsHardUpdate(HardUpdate, _BuffersToo):
 
     def _step(self, p_source: TensorDictBase, p_target: TensorDictBase) -> None:
         dim, runs = p_target.ndim, len(self.counts)  # a stack of N critics is [N, R, ...]
+        if runs == 1:  # numbers of a single run's networks may have no dimension
+            p_target.data.copy_(p_source.data)
+            return
         for key, target in p_target.items(True, True):
             source, delayed = (
                 each.data.unflatten(dim, (runs, -1)).movedim(dim, 0) for each in (p_source.get(key), target)

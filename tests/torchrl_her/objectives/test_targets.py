@@ -6,7 +6,8 @@ from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
 from torchrl.objectives import HardUpdate, LossModule, SoftUpdate
 
 from torchrl_her import LossLearner, make_actor, make_critic, make_ddpg_loss, make_target_updater
@@ -159,3 +160,32 @@ def test_statistics_move_once_a_step_and_those_of_the_target_follow(
         learner.update(data)
         networks = (loss.value_network_params, loss.target_value_network_params)
         assert [params[MEAN][0, 0, 0].item() for params in networks] == pytest.approx(list(means))
+
+
+class OwnCritic(nn.Module):
+    """A critic with a count of batches, which is a whole number, and a weight without a dimension."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.norm, self.linear, self.scale = (
+            nn.BatchNorm1d(9),
+            nn.Linear(9, 1),
+            nn.Parameter(torch.tensor(2.0)),
+        )
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        return self.linear(self.norm(torch.cat(inputs, -1))) * self.scale
+
+
+@pytest.mark.parametrize(("hard_interval", "moved"), [(0, 0.5), (1, 1.0)])
+def test_targets_of_networks_from_elsewhere_follow(hard_interval: int, moved: float) -> None:
+    seen = ["observation", "desired_goal", "action"]
+    loss = make_ddpg_loss(
+        make_actor((4, 2), 3), TensorDictModule(OwnCritic(), in_keys=seen, out_keys=["state_action_value"])
+    )
+    target = make_target_updater(loss, tau=0.5, hard_interval=hard_interval)
+    online, delayed = loss.value_network_params.data, loss.target_value_network_params.data
+    for key, start in (("scale", 2.0), (("norm", "running_mean"), 0.0)):
+        online["module"][key].fill_(4.0)
+        target.step()
+        assert (delayed["module"][key] == start + moved * (4.0 - start)).all()
