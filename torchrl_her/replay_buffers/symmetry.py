@@ -40,7 +40,8 @@ class Symmetry:
         shifts: groups of columns that can be moved.
 
     Raises:
-        ValueError: there is no symmetry, a column is negative, or a number is not finite or not positive.
+        ValueError: there is no symmetry, ``mirror`` is no mapping, a column is negative, or a number is not
+            finite or not positive.
 
     Example:
         >>> Symmetry(mirror={0: 0.5}, mirror_action=[0]).mirror
@@ -52,6 +53,8 @@ class Symmetry:
     shifts: Sequence[Shift] = ()
 
     def __post_init__(self) -> None:
+        if not isinstance(self.mirror, Mapping):
+            raise ValueError(f"mirror of a symmetry must be a value for each column, got {self.mirror!r}")
         if not self.mirror and not self.shifts:
             raise ValueError("a symmetry needs columns that are mirrored or shifted, got none")
         for each in (*self.columns, *self.mirror_action):

@@ -15,7 +15,7 @@ from torchrl_her_recipes.config.choices.order import ORDER, Order
 from torchrl_her_recipes.config.choices.weights import WEIGHTS, Weights
 from torchrl_her_recipes.config.loggers import check_loggers
 from torchrl_her_recipes.config.options import AUTO, Group, Needs, option
-from torchrl_her_recipes.config.plain_files import read_yaml
+from torchrl_her_recipes.config.plain_files import read_mapping, read_yaml
 from torchrl_her_recipes.config.shipped import find_file
 
 
@@ -151,7 +151,7 @@ class ReplayConfig(Group):
     def __post_init__(self) -> None:
         super().__post_init__()
         if isinstance(self.symmetry, str):  # read at once: a saved recipe must not need the file
-            object.__setattr__(self, "symmetry", read_yaml(find_file("symmetry", self.symmetry)))
+            object.__setattr__(self, "symmetry", read_mapping(find_file("symmetry", self.symmetry)))
         if self.symmetry is not None and not isinstance(self.symmetry, Mapping):
             raise ValueError(f"symmetry must be a mapping, got {self.symmetry!r}")
         if self.batch_size > self.buffer_size:
@@ -250,7 +250,7 @@ class CurriculumConfig(Group):
         if self.name != "task" and self.stages is None:  # read at once: a saved recipe must not need the file
             object.__setattr__(self, "stages", read_yaml(find_file("curriculum", self.name, "task")))
         stages = self.stages
-        if stages is not None and not (
+        if (self.name, stages) != ("task", None) and not (
             isinstance(stages, list | tuple)
             and stages
             and all(isinstance(stage, Mapping) for stage in stages)

@@ -69,6 +69,20 @@ def test_a_file_of_ones_own(tmp_path: Path) -> None:
         load_preset("demoo")
 
 
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        ("curriculum", "a curriculum must be a list of stages, .* got None"),
+        ("symmetry", r"own\.yaml cannot be read: it must hold names and values, got None"),
+    ],
+)
+def test_an_empty_file_is_refused(tmp_path: Path, option: str, message: str) -> None:
+    file = tmp_path / "own.yaml"
+    file.write_text("# nothing yet\n")
+    with pytest.raises(ValueError, match=message):
+        make_recipe(algo="cher", **{option: str(file)})
+
+
 def test_a_preset_begins_with_another_one(tmp_path: Path) -> None:
     file = tmp_path / "own.yaml"
     file.write_text("preset: demo\ntau: 0.01\nrun: {epochs: 3}\n")

@@ -83,6 +83,7 @@ def test_a_run_draws_the_same_beside_others() -> None:
     ("options", "message"),
     [
         ({}, "needs columns that are mirrored or shifted, got none"),
+        ({"mirror": [0, 1]}, r"mirror of a symmetry must be a value for each column, got \[0, 1\]"),
         ({"mirror": {-1: 0.0}}, "columns of a symmetry must be whole numbers from 0 on, got -1"),
         ({"mirror": {0: float("nan")}}, "mirrored at finite values, got nan"),
         ({"shifts": [Shift([0], 0.0)]}, "most of a shift must be positive and finite, got 0.0"),
