@@ -143,7 +143,8 @@ class Exploration(TensorDictModuleBase):
         if exploration_type() not in (ExplorationType.RANDOM, None):
             return tensordict
         key = self.in_keys[0]
-        greedy = tensordict.get(key)
+        action = tensordict.get(key)
+        greedy = torch.atleast_1d(action)  # a discrete action of a single environment has no dimension
         runs = len(self.generators)
         if len(greedy) % runs:
             raise ValueError(f"the number of rows must be a multiple of runs={runs}, got {len(greedy)}")
@@ -152,7 +153,7 @@ class Exploration(TensorDictModuleBase):
             self._explore(block, epsilon, generator)
             for block, epsilon, generator in zip(blocks, self.epsilon, self.generators, strict=True)
         ]
-        return tensordict.set(key, torch.cat(actions))
+        return tensordict.set(key, torch.cat(actions).view(action.shape))
 
     @abstractmethod
     def _explore(self, greedy: Tensor, epsilon: Tensor, generator: torch.Generator | None) -> Tensor:
@@ -231,6 +232,20 @@ class DecayingEpsilonGreedy(Exploration):
         check_whole(actions=actions)
         super().__init__(**options)
         self.actions = actions
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Replaces greedy actions by exploring ones, unless exploration is switched off.
+
+        Raises:
+            ValueError: as in :class:`~torchrl_her.modules.Exploration`, or actions are one-hot.
+        """
+        action = tensordict.get(self.in_keys[0])
+        if action.shape[tensordict.ndim :] == (self.actions,) and self.actions > 1:
+            raise ValueError(
+                f"actions must be whole numbers (categorical), got {action.dtype} of shape "
+                f"{list(action.shape)} (one-hot?)"
+            )
+        return super().forward(tensordict)
 
     def _explore(self, greedy: Tensor, epsilon: Tensor, generator: torch.Generator | None) -> Tensor:
         if greedy.is_floating_point() or greedy.dtype is torch.bool:

@@ -264,6 +264,13 @@ def test_rows_must_be_equal_blocks() -> None:
         exploration(TensorDict({"action": torch.zeros(5, dtype=torch.int64)}, [5]))
 
 
-def test_one_hot_actions_are_refused() -> None:
-    with pytest.raises(ValueError, match="whole numbers .categorical., got torch.bool"):
-        DecayingEpsilonGreedy(4)(TensorDict({"action": torch.eye(4).bool()}, [4]))
+@pytest.mark.parametrize("dtype", [torch.bool, torch.int64])  # int64 is the type of TorchRL's OneHot
+def test_one_hot_actions_are_refused(dtype: torch.dtype) -> None:
+    with pytest.raises(ValueError, match=f"whole numbers .categorical., got {dtype}"):
+        DecayingEpsilonGreedy(4)(TensorDict({"action": torch.eye(4).to(dtype)}, [4]))
+
+
+def test_the_counted_action_of_a_single_environment_explores() -> None:
+    explored = DecayingEpsilonGreedy(4, start=1.0)(TensorDict({"action": torch.tensor(2)}))["action"]
+    assert explored.shape == ()
+    assert 0 <= int(explored) < 4
