@@ -125,6 +125,7 @@ def costly(lengths: list[list[int]]) -> tuple[EnvReward, TensorDict]:
         lambda a, d, info: near(a, d)[0] - info["info", "cost"],
         lambda a, d, info: near(a, d)[1] & (info["info", "cost"] > 0),
         info_keys=[("info", "cost")],
+        achieved_reward=-0.9,
     )
     after = batch["next"]
     after["reward"] = rule(after["achieved_goal"], after["desired_goal"], after)[0]

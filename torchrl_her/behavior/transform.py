@@ -51,7 +51,6 @@ class BehaviorGoals(Transform):
         memory: number of goals that each run remembers.
         runs: R, the number of independent runs.
         generators: generators, one for each run; None for torch's own, with one run only.
-        achieved_reward: the reward of an achieved goal; None for that of the reward function, or 0.
         continues_after_termination: whether the environment can be stepped further after it terminated an
             episode; if not, the episode is truncated there.
         keys: keys of the entries that are read. All are also written, except observation and achieved goal.
@@ -93,7 +92,6 @@ class BehaviorGoals(Transform):
         memory: int = 50_000,
         runs: int = 1,
         generators: Sequence[torch.Generator] | None = None,
-        achieved_reward: float | None = None,
         continues_after_termination: bool = False,
         keys: EnvKeys = EnvKeys(),
         real_goal_key: NestedKey = "real_desired_goal",
@@ -110,7 +108,7 @@ class BehaviorGoals(Transform):
         super().__init__(in_keys=in_keys, out_keys=out_keys)
         self.generators: Generators = check_generators(runs, generators) or [None]
         self.reward_fn, self.remember, self.real_share = reward_fn, remember, real_share
-        self.runs, self.achieved_reward = runs, achieved_reward_of(reward_fn, achieved_reward)
+        self.runs, self.achieved_reward = runs, achieved_reward_of(reward_fn)
         self.continues_after_termination = continues_after_termination
         self.memory = AchievedGoals(memory, runs=runs)
         self.keys, self.stage_key, self.stage = keys, stage_key, stage

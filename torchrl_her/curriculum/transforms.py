@@ -323,8 +323,8 @@ class StageOutcomes(Transform):
         progress: progress that counts the outcomes.
 
     Keyword Args:
-        reward_fn, achieved_reward: decide which goals are achieved in the last stage, where achieving a goal
-            need not terminate; see :func:`~torchrl_her.goals.is_achieved`.
+        reward_fn: decides which goals are achieved in the last stage, where achieving a goal need not
+            terminate; see :func:`~torchrl_her.goals.is_achieved`.
         keys: keys of the reward and the flag ``done``, which are read.
         stage_key: key of the stage, which is read.
     """
@@ -334,13 +334,12 @@ class StageOutcomes(Transform):
         progress: EpisodeStages,
         *,
         reward_fn: RewardFunction | None = None,
-        achieved_reward: float | None = None,
         keys: EnvKeys = EnvKeys(),
         stage_key: NestedKey = "stage",
     ) -> None:
         super().__init__()
         self.progress, self.stage_key = progress, stage_key
-        self.reward_fn, self.achieved_reward, self.keys = reward_fn, achieved_reward, keys
+        self.reward_fn, self.keys = reward_fn, keys
         stages = progress.curriculum.stages
         self._least = torch.tensor([stage.rewards[1] for stage in stages], dtype=torch.float64)
 
@@ -351,7 +350,7 @@ class StageOutcomes(Transform):
             stage, runs = tensordict.get(self.stage_key), self.progress.runs
             stages = len(self.progress.curriculum)
             reward = next_tensordict.get(self.keys.reward)
-            met = is_achieved(next_tensordict, self.reward_fn, achieved_reward=self.achieved_reward)
+            met = is_achieved(next_tensordict, self.reward_fn)
             below = reward >= self._least.to(reward)[stage]
             met = torch.where(stage == stages - 1, met.view_as(stage), below)
             achieved = ended & met

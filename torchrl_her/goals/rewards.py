@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 from collections.abc import Callable, Sequence
 from functools import reduce
 from typing import Any, Protocol, TypeAlias
@@ -29,7 +30,10 @@ class RewardFunction(Protocol):
     ``info_keys`` gets a third argument, the info: a tensordict of these entries of the transition, whose
     dimensions [...] are broadcast against those of the goals. Entries are read under ``next``, or in the root
     if ``next`` lacks them, as it lacks ``action``. When the relabeling filter calls the function for goals
-    that were achieved before the action, entries are read in the root first.
+    that were achieved before the action, entries are read in the root first. A goal is achieved
+    if its reward is at least ``achieved_reward``, if the function has this attribute and it is not None, or
+    else 0. A transition that terminated with a lower reward failed, such as by a fall: relabeled, it also
+    terminates, with the same cost.
     """
 
     def __call__(self, achieved_goal: Tensor, desired_goal: Tensor, /) -> tuple[Tensor, Tensor]: ...
@@ -124,6 +128,11 @@ class EnvReward:
     Keyword Args:
         info_keys: further entries of the transition, which both functions get as a third argument; see
             :class:`~torchrl_her.goals.RewardFunction`.
+        achieved_reward: the least reward of an achieved goal; None for 0.
+
+    Raises:
+        TypeError: ``info_keys`` is a single key.
+        ValueError: ``achieved_reward`` is not finite.
 
     Example:
         >>> rule = EnvReward(lambda a, d: -(a - d).abs(), lambda a, d: a == d)
@@ -140,12 +149,16 @@ class EnvReward:
         compute_terminated: Callable[..., Tensor] | None = None,
         *,
         info_keys: Sequence[NestedKey] = (),
+        achieved_reward: float | None = None,
     ) -> None:
         if isinstance(info_keys, str):  # each character would be taken for a key
             raise TypeError(f"info_keys must be a list, got {info_keys!r}: write [{info_keys!r}]")
+        if achieved_reward is not None and not math.isfinite(achieved_reward):
+            raise ValueError(f"achieved_reward must be finite, got {achieved_reward}")
         self.compute_reward = compute_reward
         self.compute_terminated = compute_terminated
         self.info_keys = [unravel_key(key) for key in info_keys]
+        self.achieved_reward = achieved_reward
 
     def __call__(
         self, achieved_goal: Tensor, desired_goal: Tensor, *info: TensorDictBase
@@ -269,10 +282,8 @@ def _checked(reward: Tensor, shape: torch.Size) -> Tensor:
     return reward.reshape(shape)
 
 
-def missed(
-    reward_fn: RewardFunction, achieved: Outcome, desired_goal: Tensor, achieved_reward: float | None
-) -> Tensor:
-    """Returns a mask [...] of the pairs of goals [..., g] whose reward is below the given one.
+def missed(reward_fn: RewardFunction, achieved: Outcome, desired_goal: Tensor) -> Tensor:
+    """Returns a mask [...] of the pairs of goals [..., g] whose reward is below that of an achieved goal.
 
     ``terminated`` is not needed, so an :class:`EnvReward` computes the reward alone, in half the time.
 
@@ -280,7 +291,6 @@ def missed(
         reward_fn: maps (achieved, desired) goals to (reward, terminated).
         achieved: goals [..., g], with the info that the function reads (``outcomes``).
         desired_goal: [..., g], broadcast against the achieved goals.
-        achieved_reward: the least reward of an achieved goal; None as for :func:`is_achieved`.
 
     Raises:
         ValueError: there is not one finite reward for each pair of goals.
@@ -289,17 +299,17 @@ def missed(
         value = reward_fn.compute_reward(*_arguments(achieved, desired_goal))
     else:
         value = _call(reward_fn, achieved, desired_goal)[0]
-    return _checked(value, _pairs(achieved, desired_goal)) < achieved_reward_of(reward_fn, achieved_reward)
+    return _checked(value, _pairs(achieved, desired_goal)) < achieved_reward_of(reward_fn)
 
 
-def achieved_reward_of(reward_fn: RewardFunction | None, given: float | None) -> float:
-    """Returns the least reward of an achieved goal: the given one, or else the reward function's, or 0.
+def achieved_reward_of(reward_fn: RewardFunction) -> float:
+    """Returns the least reward of an achieved goal: that of the reward function, or 0 if it has none.
 
     Example:
-        >>> achieved_reward_of(GoalReward(0.1, missed_reward=0.0, achieved_reward=1.0), None)
+        >>> achieved_reward_of(GoalReward(0.1, missed_reward=0.0, achieved_reward=1.0))
         1.0
     """
-    return float(getattr(reward_fn, "achieved_reward", 0.0) if given is None else given)
+    return float(getattr(reward_fn, "achieved_reward", None) or 0.0)
 
 
 def ends_at_goals(reward_fn: RewardFunction, goals: Outcome) -> bool:
@@ -318,9 +328,7 @@ def ends_at_goals(reward_fn: RewardFunction, goals: Outcome) -> bool:
     return bool(call_reward(reward_fn, some, _arguments(some, torch.empty(0))[0])[1].any())
 
 
-def is_achieved(
-    after: TensorDictBase, reward_fn: RewardFunction | None = None, *, achieved_reward: float | None = None
-) -> Tensor:
+def is_achieved(after: TensorDictBase, reward_fn: RewardFunction | None = None) -> Tensor:
     """Returns whether steps achieved their goals: by the environment's own flag, else by a reward function.
 
     The environment's flag is the entry ``is_success``. The reward of a step is the last resort, because it
@@ -328,11 +336,8 @@ def is_achieved(
 
     Args:
         after: [...], the entry ``next`` of steps.
-        reward_fn: maps (achieved, desired) goals to (reward, terminated); None for the reward of the step.
-
-    Keyword Args:
-        achieved_reward: the least reward of an achieved goal; None for that of the reward function, if it has
-            an attribute of this name as :class:`~torchrl_her.GoalReward` has, or else 0.
+        reward_fn: maps (achieved, desired) goals to (reward, terminated); None for the reward of the step,
+            which is at least 0 where the goal is achieved.
 
     Returns:
         Mask [...] of the steps that achieved their goals.
@@ -348,6 +353,6 @@ def is_achieved(
     if word is not None:
         return word.bool().view(after.shape)
     if reward_fn is None:
-        return (after.get("reward") >= achieved_reward_of(None, achieved_reward)).view(after.shape)
+        return (after.get("reward") >= 0.0).view(after.shape)
     reached = outcomes(reward_fn, after.get("achieved_goal"), after)
-    return ~missed(reward_fn, reached, after.get("desired_goal"), achieved_reward)
+    return ~missed(reward_fn, reached, after.get("desired_goal"))

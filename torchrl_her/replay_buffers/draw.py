@@ -116,7 +116,7 @@ def draw_for_runs(
     after = entry_of(rows, chunk.keys.next_achieved)
     keep = None
     if options.filter_achieved:
-        rule = partial(missed, reward_fn, achieved_reward=options.achieved_reward)
+        rule = partial(missed, reward_fn)
         before = chunk.before()
         starts = None if ends_at_goals(reward_fn, chunk.after()) else before[episodes.rows[:, 0]]
         keep = drawn.filter(before, rule, starts)

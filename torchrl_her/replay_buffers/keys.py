@@ -75,12 +75,10 @@ class TransitionKeys:
                 f"goals must be vectors of one width, {[*rows.shape, 'g']}, got {shapes}: flatten images"
             )
 
-    def rewards(
-        self, rows: TensorDictBase, reward_fn: RewardFunction, achieved_reward: float | None
-    ) -> tuple[Tensor, Tensor]:
+    def rewards(self, rows: TensorDictBase, reward_fn: RewardFunction) -> tuple[Tensor, Tensor]:
         """Returns the rewards [n] of a function plus the costs of failures, and the collected rewards [n]."""
         computed, _ = ask_reward(reward_fn, self.after(rows, reward_fn), entry_of(rows, self.goals[1]))
-        cost = failures(rows, self, reward_fn, achieved_reward)[1]
+        cost = failures(rows, self, reward_fn)[1]
         return (computed + cost).flatten(), entry_of(rows, self.reward).flatten()
 
     def changes(
@@ -102,10 +100,7 @@ class TransitionKeys:
 
 
 def failures(
-    transitions: TensorDictBase,
-    keys: TransitionKeys,
-    reward_fn: RewardFunction,
-    achieved_reward: float | None,
+    transitions: TensorDictBase, keys: TransitionKeys, reward_fn: RewardFunction
 ) -> tuple[Tensor, Tensor]:
     """Returns where an episode terminated without achieving its goal, such as by a fall, and the cost.
 
@@ -122,13 +117,12 @@ def failures(
         >>> goals = {"achieved_goal": torch.tensor([[0.0], [5.0]]), "desired_goal": torch.zeros(2, 1)}
         >>> after = {"terminated": torch.ones(2, 1).bool(), "reward": torch.tensor([[0.0], [-6.0]]), **goals}
         >>> keys = HindsightOptions().transition_keys()
-        >>> failed, cost = failures(TensorDict({"next": after}, [2]), keys, GoalReward(0.1), 0.0)
+        >>> failed, cost = failures(TensorDict({"next": after}, [2]), keys, GoalReward(0.1))
         >>> failed.tolist(), cost.tolist()
         ([[False], [True]], [[0.0], [-5.0]])
     """
     reward, terminated = (entry_of(transitions, key).reshape(-1) for key in (keys.reward, keys.terminated))
-    least = achieved_reward_of(reward_fn, achieved_reward)
-    failed, cost = terminated & (reward < least), torch.zeros_like(reward)
+    failed, cost = terminated & (reward < achieved_reward_of(reward_fn)), torch.zeros_like(reward)
     at = failed.nonzero().squeeze(-1)
     if len(at) > 0:  # if the reward function ends the episode, it is a success, whatever its reward
         reached, desired = keys.after(transitions, reward_fn)[at], entry_of(transitions, keys.goals[1])[at]

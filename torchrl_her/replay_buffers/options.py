@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
@@ -68,10 +67,6 @@ class HindsightOptions:
             nothing had moved yet.
         redraw: True replaces a goal that the filter refuses by one that it keeps. False writes no virtual
             transition for it.
-        achieved_reward: the reward of an achieved goal; with any lower reward a goal is not achieved. A
-            transition that terminated with a lower reward failed, such as by a fall: it also terminates for
-            virtual goals, with the same reward. None: the ``achieved_reward`` of the reward function, as
-            :class:`~torchrl_her.GoalReward` has it, or else 0.
         exclude: entries to leave out, in the root and under ``next``; the observation is never left out. By
             default ``state``, because it holds the real goal. Add whatever else was computed from the desired
             goal.
@@ -110,7 +105,6 @@ class HindsightOptions:
     gamma: float | None = None
     filter_achieved: bool = False
     redraw: bool = True
-    achieved_reward: float | None = None
     exclude: Sequence[NestedKey] = ("state",)
     keys: EnvKeys = EnvKeys()
     trajectory_key: NestedKey = ("collector", "traj_ids")
@@ -132,8 +126,6 @@ class HindsightOptions:
             )
         if self.n_steps > 1 and (self.gamma is None or not 0 < self.gamma <= 1):
             raise ValueError(f"n_steps={self.n_steps} needs the loss's gamma, in (0, 1], got {self.gamma}")
-        if self.achieved_reward is not None and not math.isfinite(self.achieved_reward):
-            raise ValueError(f"achieved_reward must be finite, got {self.achieved_reward}")
         get_strategy(self.strategy)
         in_root_and_next(self.exclude)
         if self.goal_sources is not None:
@@ -251,7 +243,6 @@ class HindsightBase:
 
     k: int
     filter_achieved: bool
-    achieved_reward: float | None
 
     def __init__(
         self,
@@ -286,11 +277,11 @@ class HindsightBase:
         self._exclude = in_root_and_next(excluded)
 
     def _compare_rewards(self, rows: TensorDictBase) -> None:
-        """Warns if the first rows [n] ever written show that rewards or ``achieved_reward`` are wrong."""
+        """Warns if the first rows [n] that are written show that the reward function is wrong."""
         if self._compared or self.k == 0:
             return
         self._compared = True
-        computed, reward = self._keys.rewards(rows, self.reward_fn, self.achieved_reward)
+        computed, reward = self._keys.rewards(rows, self.reward_fn)
         differ = ((reward - computed).abs() > LEAST_COST * (1 + computed.abs())).nonzero()
         if len(differ) > 0:
             one, other = (values[differ[0, 0]].item() for values in (computed, reward))
@@ -300,14 +291,15 @@ class HindsightBase:
                 "virtual transitions get the rewards of this function (this warning appears once)",
                 stacklevel=4,
             )
-        if self.achieved_reward is not None or hasattr(self.reward_fn, "achieved_reward"):
+        if getattr(self.reward_fn, "achieved_reward", None) is not None:
             return
         goals = entry_of(rows, self._keys.next_achieved)
         equal = ask_reward(self.reward_fn, self._keys.after(rows, self.reward_fn), goals)[0].max().item()
         if abs(equal) > LEAST_COST:
             warnings.warn(
                 f"goals with a reward of at least 0 count as achieved, but equal goals have {equal:g}; give "
-                f"the reward of an achieved goal, achieved_reward={equal:g} (this warning appears once)",
+                f"the reward of an achieved goal: EnvReward(..., achieved_reward={equal:g}), or an attribute "
+                "of this name of another reward function (this warning appears once)",
                 stacklevel=4,
             )
 

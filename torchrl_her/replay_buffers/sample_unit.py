@@ -272,7 +272,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
         else:
             achieved = self._keys.after(data, self.reward_fn)[rows]
             reward, terminated = ask_reward(self.reward_fn, achieved, chosen.goals)
-            failed, cost = failures(data, self._keys, self.reward_fn, self.achieved_reward)
+            failed, cost = failures(data, self._keys, self.reward_fn)
             reward, terminated = reward + cost[rows], terminated | failed[rows]
         truncated = entry_of(out, self._keys.truncated)[rows]
         for key, value in self._keys.changes(chosen.goals, reward, terminated, truncated).items():
@@ -373,7 +373,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
             desired = goals.unsqueeze(1).expand(-1, window.shape[1], -1)
             reached = self._keys.after(stored.rows, self.reward_fn)[window[virtual]]
             own_reward, own_end = ask_reward(self.reward_fn, reached, desired)
-            failed, cost = failures(stored.rows, self._keys, self.reward_fn, self.achieved_reward)
+            failed, cost = failures(stored.rows, self._keys, self.reward_fn)
             own_reward = own_reward + cost[window[virtual]]
             reward[virtual] = stored_as(own_reward, reward[0], self._keys.reward).view_as(own_reward)
             end[virtual] = own_end | failed[window[virtual]]
@@ -495,7 +495,7 @@ class HERSampleUnit(HindsightBase, SampleUnit):
 
     def _kept(self, stored: _Stored, group: Tensor, goals: Tensor) -> Tensor:
         """Applies the filter: returns a mask [V, c] of the goals [V, c, g] that groups [V, L] may take."""
-        rule = partial(missed, self.reward_fn, achieved_reward=self.achieved_reward)
+        rule = partial(missed, self.reward_fn)
         before = self._keys.before(stored.rows, self.reward_fn)
         kept = rule(before[group].unsqueeze(1), goals.unsqueeze(2)).all(-1)
         if stored.ends():

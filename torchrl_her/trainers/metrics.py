@@ -34,18 +34,13 @@ def at_the_end(rollout: TensorDictBase, values: Tensor) -> Tensor:
     return values.gather(-1, last).squeeze(-1)
 
 
-def success(
-    rollout: TensorDictBase, reward_fn: RewardFunction | None = None, *, achieved_reward: float | None = None
-) -> Tensor:
+def success(rollout: TensorDictBase, reward_fn: RewardFunction | None = None) -> Tensor:
     """Returns whether the goal is achieved at the last step of the episode, as papers on Fetch measure it.
 
     Args:
         rollout: [N, T], T steps of each of N environments.
         reward_fn: decides which goals are achieved if the rollout lacks the entry ``("next", "is_success")``;
             see :func:`~torchrl_her.goals.is_achieved`.
-
-    Keyword Args:
-        achieved_reward: the least reward of an achieved goal; None for that of the reward function, or 0.
 
     Returns:
         Mask [N] of the successful episodes.
@@ -57,15 +52,13 @@ def success(
         >>> success(left).tolist(), reached(left).tolist()
         ([False], [True])
     """
-    return at_the_end(rollout, is_achieved(rollout["next"], reward_fn, achieved_reward=achieved_reward))
+    return at_the_end(rollout, is_achieved(rollout["next"], reward_fn))
 
 
-def reached(
-    rollout: TensorDictBase, reward_fn: RewardFunction | None = None, *, achieved_reward: float | None = None
-) -> Tensor:
+def reached(rollout: TensorDictBase, reward_fn: RewardFunction | None = None) -> Tensor:
     """Returns whether the goal is achieved at some step; arguments as for :func:`torchrl_her.success`."""
     inside = first_episode(rollout.get(("next", "done")).squeeze(-1))
-    return (inside & is_achieved(rollout["next"], reward_fn, achieved_reward=achieved_reward)).any(-1)
+    return (inside & is_achieved(rollout["next"], reward_fn)).any(-1)
 
 
 def final_distance(rollout: TensorDictBase) -> Tensor:

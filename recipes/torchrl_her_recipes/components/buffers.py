@@ -27,7 +27,7 @@ from torchrl_her.replay_buffers.keys import in_root_and_next
 from torchrl_her.replay_buffers.stage_rules import StageRule
 from torchrl_her.replay_buffers.symmetry import AugmentBatch, Shift, Symmetry
 from torchrl_her.replay_buffers.writer import HERWriter
-from torchrl_her_envs.common.goal_env import goal_env, reward_range
+from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_recipes.components.curricula import CurriculumState
 from torchrl_her_recipes.components.devices import ON_THE_CPU, Devices
 from torchrl_her_recipes.components.envs import task_reward
@@ -120,7 +120,6 @@ def _make_writer(options: HindsightConfig, env: EnvBase, **others: Any) -> HERWr
         filter_achieved=algorithm.filter,
         redraw=options.redraw,
         refill=options.refill if algorithm.filter else 1,
-        achieved_reward=reward_range(goal_env(env))[1],
         exclude=_NOT_STORED,
         **others,
     )

@@ -114,7 +114,7 @@ class TaskEnvs:
         if "termination" in get_task_spec(task.name).options and task.failure != "environment":
             missed = reward_range(goal_env(env))[0]
             worth = missed / (1 - self.gamma) if task.failure == "never_pays" else None
-            transforms.append(Failures(worth, judging(env)))
+            transforms.append(Failures(worth, task_reward(env)))
         low, high = action_bounds(env)
         if not (low.eq(-1).all() and high.eq(1).all()):
             transforms.append(ActionScaling())
@@ -136,9 +136,9 @@ def action_bounds(env: EnvBase) -> tuple[Tensor, Tensor]:
 def task_reward(env: EnvBase) -> EnvReward:
     """Returns the reward function of a task's environment, ignoring any transforms around it."""
     task = goal_env(env)
-    return EnvReward(task.compute_reward, task.compute_terminated, info_keys=task.info_keys)
-
-
-def judging(env: EnvBase) -> dict[str, Any]:
-    """Returns arguments for :func:`~torchrl_her.success`, for rollouts without an entry ``is_success``."""
-    return {"reward_fn": task_reward(env), "achieved_reward": reward_range(goal_env(env))[1]}
+    return EnvReward(
+        task.compute_reward,
+        task.compute_terminated,
+        info_keys=task.info_keys,
+        achieved_reward=task.achieved_reward,
+    )

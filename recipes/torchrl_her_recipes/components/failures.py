@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from tensordict import TensorDictBase
 from torchrl.envs import Transform
 
-from torchrl_her.goals.rewards import is_achieved
+from torchrl_her.goals.rewards import RewardFunction, is_achieved
 
 
 class Failures(Transform):
@@ -20,18 +18,18 @@ class Failures(Transform):
 
     Args:
         worth: the reward of a failure; None to truncate the episode without changing the reward.
-        judged_by: arguments of :func:`~torchrl_her.goals.is_achieved`, which decides if a goal is achieved.
+        reward_fn: decides if a goal is achieved, see :func:`~torchrl_her.goals.is_achieved`.
     """
 
-    def __init__(self, worth: float | None, judged_by: dict[str, Any]) -> None:
+    def __init__(self, worth: float | None, reward_fn: RewardFunction) -> None:
         super().__init__()
-        self.worth, self.judged_by = worth, judged_by
+        self.worth, self.reward_fn = worth, reward_fn
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         terminated = next_tensordict.get("terminated")
         if not bool(terminated.any()):
             return next_tensordict
-        achieved = is_achieved(next_tensordict, **self.judged_by).view(terminated.shape)
+        achieved = is_achieved(next_tensordict, self.reward_fn).view(terminated.shape)
         failed = terminated & ~achieved
         if self.worth is None:
             next_tensordict.set("terminated", terminated & achieved)

@@ -15,7 +15,7 @@ from torch import Tensor
 from torchrl_her.goals.rewards import Outcome, ask_reward, is_achieved, missed, outcomes
 from torchrl_her_envs.common.goal_env import GoalEnv, goal_env
 from torchrl_her_envs.common.goal_rules import GoalEnds, say_once
-from torchrl_her_recipes.components.envs import TaskEnvs, action_bounds, judging, task_reward
+from torchrl_her_recipes.components.envs import TaskEnvs, action_bounds, task_reward
 from torchrl_her_recipes.config.options import AUTO
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.config.resolve import TERMINATION, EnvFacts, auto_options, left_open, resolve
@@ -184,12 +184,11 @@ def _facts(
     played: list[TensorDictBase], task: GoalEnv, seconds: float, actions: list[tuple[float, float]] | None
 ) -> Facts:
     rows = cast(TensorDictBase, torch.cat(cast(list[Tensor], played)))
-    achieved_reward = task.achieved_reward
-    rule, judged_by = task_reward(task), judging(task)
+    rule = task_reward(task)
 
     def meets(achieved: Outcome, desired: Tensor) -> Tensor:
         """Returns whether goals are achieved, [...] of bool."""
-        return ~missed(rule, achieved, desired, achieved_reward)
+        return ~missed(rule, achieved, desired)
 
     moved, some_kept, achieved, fallen = [], [], [], []
     for episode in played:
@@ -202,11 +201,11 @@ def _facts(
         moved.append(not bool(meets(before[:1], goals).all()))
         achieved.append(bool(meets(after, episode["next", "desired_goal"]).any()))
         last = episode["next"][-1:]
-        fallen.append(bool(last["terminated"].all() and not is_achieved(last, **judged_by).all()))
+        fallen.append(bool(last["terminated"].all() and not is_achieved(last, rule).all()))
     reached = outcomes(rule, rows["next", "achieved_goal"], rows["next"])
     computed, reward = ask_reward(rule, reached, rows["next", "desired_goal"])[0], rows["next", "reward"]
     # A failure may have a penalty that ``compute_reward`` does not give.
-    went_on = ~rows["next", "terminated"] | (computed >= achieved_reward)
+    went_on = ~rows["next", "terminated"] | (computed >= task.achieved_reward)
     differ = went_on & ((reward - computed).abs() > _DIGITS * (1 + computed.abs()))
     observations = rows["observation"].double()
     spread = observations.std(0)

@@ -14,7 +14,7 @@ from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_recipes.components.assembly import eval_seeds
 from torchrl_her_recipes.components.components import Components
 from torchrl_her_recipes.components.curricula import CurriculumState
-from torchrl_her_recipes.components.envs import judging, play_episodes
+from torchrl_her_recipes.components.envs import play_episodes, task_reward
 
 
 def play_greedily(components: Components, env: EnvBase, epoch: int) -> TensorDictBase:
@@ -29,13 +29,12 @@ def stage_success(
 ) -> Tensor:
     """Returns success [R, n] at goals of each run's stage; ``rollout`` has episodes of the full task."""
     runs, last = components.recipe.run.num_runs, len(state.curriculum) - 1
-    judged_by = judging(components.eval_env)
-    full = success(rollout, **judged_by).float().view(runs, -1)
+    full = success(rollout, task_reward(components.eval_env)).float().view(runs, -1)
     below = state.progress.stage < last
     if state.stage_env is None or not bool(below.any()):
         return full
     played = play_greedily(components, state.stage_env, epoch)
-    met = played["next", "reward"].squeeze(-1) >= judged_by["achieved_reward"]  # of the stage's goal
+    met = played["next", "reward"].squeeze(-1) >= components.rewards[1]  # of the stage's goal
     in_stage = at_the_end(played, met).float().view(runs, -1)
     return torch.where(below.unsqueeze(1), in_stage, full)
 

@@ -15,7 +15,7 @@ from torchrl_her.objectives.critics import critic_value
 from torchrl_her.trainers.metrics import discounted_return, final_distance, q_bias, reached, success
 from torchrl_her_recipes.components.components import Components
 from torchrl_her_recipes.components.devices import place_of
-from torchrl_her_recipes.components.envs import judging
+from torchrl_her_recipes.components.envs import task_reward
 from torchrl_her_recipes.runs.notices import saturation
 
 
@@ -27,15 +27,15 @@ def measure(components: Components, rollout: TensorDictBase) -> dict[str, Tensor
     :func:`~torchrl_her.objectives.critic_value`. ``q_bias`` is ``q`` minus the discounted return of the
     episode. Both are missing if the loss has no critics with a value of one number.
     """
-    recipe, judged_by = components.recipe, judging(components.eval_env)
-    succeeded = success(rollout, **judged_by)
+    recipe, rule = components.recipe, task_reward(components.eval_env)
+    succeeded = success(rollout, rule)
     # After truncation, an episode is assumed to stay at its goal if it is there, and else never to reach it.
     missed, achieved = components.rewards
     tail = torch.where(succeeded, achieved, missed).to(rollout["next", "reward"].dtype)
     returns = discounted_return(rollout, recipe.learner.gamma, tail_reward=tail)
     measured = {
         "success": succeeded.float(),
-        "reached": reached(rollout, **judged_by).float(),
+        "reached": reached(rollout, rule).float(),
         "distance": final_distance(rollout),
         "return": returns,
     }

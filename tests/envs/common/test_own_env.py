@@ -170,8 +170,13 @@ def test_rewards_that_read_further_entries_get_those_of_the_step(name: str) -> N
     env = make_env(f"{HERE}:{name}", num_envs=3, seed=5, info_keys=["cost"], achieved_reward=-0.5)
     check_env_specs(env)
     steps = rollout(env)
-    rule = EnvReward(env.compute_reward, env.compute_terminated, info_keys=env.info_keys)
-    writer = HERWriter(rule, k=4, filter_achieved=True, achieved_reward=env.achieved_reward)
+    rule = EnvReward(
+        env.compute_reward,
+        env.compute_terminated,
+        info_keys=env.info_keys,
+        achieved_reward=env.achieved_reward,
+    )
+    writer = HERWriter(rule, k=4, filter_achieved=True)
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(1_000), writer=writer)
     buffer.extend(steps)
     rows = buffer[:]

@@ -43,8 +43,13 @@ def test_virtual_transitions_get_the_reward_that_the_environment_gives(form: str
     assert env.info_keys == [("info", "cost")]
     torch.manual_seed(0)
     batch = env.rollout(60, break_when_any_done=False)
-    rule = EnvReward(env.compute_reward, env.compute_terminated, info_keys=env.info_keys)
-    writer = HERWriter(rule, k=4, filter_achieved=True, achieved_reward=env.achieved_reward)
+    rule = EnvReward(
+        env.compute_reward,
+        env.compute_terminated,
+        info_keys=env.info_keys,
+        achieved_reward=env.achieved_reward,
+    )
+    writer = HERWriter(rule, k=4, filter_achieved=True)
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(1_000), writer=writer)
     buffer.extend(batch)
     rows = buffer[:]

@@ -66,6 +66,12 @@ def test_a_threshold_must_be_positive(threshold: float) -> None:
         GoalReward(threshold)
 
 
+@pytest.mark.parametrize("reward", [math.nan, math.inf])
+def test_the_reward_of_an_achieved_goal_must_be_finite(reward: float) -> None:
+    with pytest.raises(ValueError, match=f"achieved_reward must be finite, got {reward}"):
+        EnvReward(lambda got, wanted: got - wanted, achieved_reward=reward)
+
+
 def test_env_reward_keeps_the_order_of_its_arguments() -> None:
     rule = EnvReward(lambda got, wanted: got - 10 * wanted, lambda got, wanted: got > wanted)
     reward, terminated = rule(goals([1.0], [5.0]), goals([2.0], [3.0]))
@@ -136,7 +142,7 @@ def test_neighboring_numbers_stay_different_and_small_thresholds_stay_above_0() 
         (lambda a, d, info: a, "missing 1 required positional argument: 'info'"),
     ],
 )
-@pytest.mark.parametrize("ask", [ask_reward, lambda *given: missed(*given, 0.0)])
+@pytest.mark.parametrize("ask", [ask_reward, missed])
 def test_the_form_of_a_reward_function_is_named(function: Any, got: str, ask: Any) -> None:
     form = r"must take \(achieved_goal, desired_goal\) and return \(reward, terminated\), tensors"
     with pytest.raises(ValueError, match=f"^the reward function {form} .*, got .*{got}"):

@@ -39,7 +39,6 @@ OTHERS = {
     "gamma": 0.9,
     "filter_achieved": True,
     "redraw": False,
-    "achieved_reward": -0.5,
     "exclude": ("state", "action"),
     "keys": EnvKeys(achieved_goal=("goals", "got"), reward="cost"),
     "trajectory_key": "path",
@@ -98,9 +97,9 @@ def test_relabeling_needs_the_flag_of_the_time_limit(make: Callable[..., Any]) -
 @both
 def test_options_are_read_and_set_as_attributes(make: Callable[..., Any]) -> None:
     part = make(REWARD, k=2)
-    part.k, part.strategy, part.filter_achieved, part.achieved_reward = 7, "final", True, 0.5
-    assert part.options == HindsightOptions(k=7, strategy="final", filter_achieved=True, achieved_reward=0.5)
-    assert (part.k, part.strategy, part.filter_achieved, part.achieved_reward) == (7, "final", True, 0.5)
+    part.k, part.strategy, part.filter_achieved = 7, "final", True
+    assert part.options == HindsightOptions(k=7, strategy="final", filter_achieved=True)
+    assert (part.k, part.strategy, part.filter_achieved) == (7, "final", True)
     for name, value, message in (("k", -1, "k must be at least 0, got -1"), ("strategy", "past", "'past'")):
         with pytest.raises(ValueError, match=message):
             setattr(part, name, value)
@@ -125,17 +124,19 @@ def test_a_reward_function_says_which_reward_an_achieved_goal_has(
     make: Callable[..., Any], lost: float, won: float
 ) -> None:
     rule = GoalReward(0.5, missed_reward=lost, achieved_reward=won)
-    rows, usual = (relabeled(make, filter_achieved=True, reward=reward) for reward in (rule, REWARD))
+    wrapped = EnvReward(lambda *goals: rule(*goals)[0], lambda *goals: rule(*goals)[1], achieved_reward=won)
+    rows, same, usual = (relabeled(make, filter_achieved=True, reward=of) for of in (rule, wrapped, REWARD))
     assert torch.equal(rows["virtual"], usual["virtual"])
     assert torch.equal(rows["next", "reward"] == won, usual["next", "reward"] == 0.0)
+    assert (same == rows).all()
 
 
 @both
 def test_a_reward_of_equal_goals_that_does_not_count_as_achieved_is_named(make: Callable[..., Any]) -> None:
     rule = GoalReward(0.5, missed_reward=0.0, achieved_reward=1.0)
-    with pytest.warns(UserWarning, match="equal goals have 1; give the reward .* achieved_reward=1 "):
+    with pytest.warns(UserWarning, match=r"equal goals have 1; give the reward .* achieved_reward=1\)"):
         relabeled(make, reward=EnvReward(lambda *goals: rule(*goals)[0]))
-    relabeled(make, reward=EnvReward(lambda *goals: rule(*goals)[0]), achieved_reward=1.0)
+    relabeled(make, reward=EnvReward(lambda *goals: rule(*goals)[0], achieved_reward=1.0))
 
 
 @both
@@ -362,7 +363,6 @@ def test_a_function_that_leaves_the_episode_is_refused_when_it_is_used(make: Cal
         ("k", True, "k must be a whole number, got True"),
         ("n_steps", 2.0, "n_steps must be a whole number, got 2.0"),
         ("recent_achieved", "9", "recent_achieved must be a whole number, got '9'"),
-        ("achieved_reward", float("nan"), "achieved_reward must be finite, got nan"),
     ],
 )
 def test_numbers_that_are_not_whole_or_not_finite_are_named(

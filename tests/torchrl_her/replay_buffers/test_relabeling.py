@@ -20,7 +20,11 @@ pytestmark = pytest.mark.filterwarnings("ignore:the reward function gives")  # m
 REWARD = GoalReward(0.5)  # tags differ by at least 1
 # The reward of a goal, which ends no episode, and one that no goal achieves.
 ENDLESS = EnvReward(lambda a, d: REWARD(a, d)[0], lambda a, d: torch.zeros_like(a[..., :1]).bool())
-NEVER = EnvReward(lambda a, d: REWARD(a, d)[0] - 1.0, lambda a, d: torch.zeros_like(a[..., :1]).bool())
+NEVER = EnvReward(
+    lambda a, d: REWARD(a, d)[0] - 1.0,
+    lambda a, d: torch.zeros_like(a[..., :1]).bool(),
+    achieved_reward=0.0,
+)
 N_STEPS: dict[str, Any] = {"n_steps": 3, "gamma": 0.5}
 
 Relabel = Callable[..., TensorDict]
@@ -101,9 +105,11 @@ def test_reward_terminated_and_done_are_recomputed_and_truncated_stays(relabel: 
 
 def test_a_real_termination_is_undone_where_the_goal_is_not_reached(relabel: Relabel) -> None:
     reward = EnvReward(
-        lambda a, d: -torch.ones_like(a[..., :1]), lambda a, d: torch.zeros_like(a[..., :1]).bool()
+        lambda a, d: -torch.ones_like(a[..., :1]),
+        lambda a, d: torch.zeros_like(a[..., :1]).bool(),
+        achieved_reward=0.0,
     )
-    rows = relabel(make_batch([[3]], terminated=True), reward=reward, k=1, achieved_reward=0.0)
+    rows = relabel(make_batch([[3]], terminated=True), reward=reward, k=1)
     for key in ("terminated", "done"):
         assert not rows["next", key][rows["virtual"]].any()
         assert torch.equal(rows["next", key], ~rows["virtual"] & (rows["observation"][:, :1] == 2))
@@ -254,7 +260,7 @@ def test_virtual_transitions_are_rewarded_with_their_own_info(
     n_steps: int, rewards: list[float], filtered: bool, relabel: Relabel
 ) -> None:
     rule, batch = costly([[3], [3]])
-    options: dict[str, Any] = {"strategy": "final", "k": 1, "achieved_reward": -0.9}
+    options: dict[str, Any] = {"strategy": "final", "k": 1}
     options |= {"n_steps": n_steps, "gamma": 0.5, "filter_achieved": filtered}
     rows = virtual_of(relabel(batch, reward=rule, **options))
     step = rows["observation"][:, :1] % 1000
@@ -275,7 +281,7 @@ def test_a_fall_terminates_virtual_transitions_too(relabel: Relabel, options: di
     """An episode that terminated without success would have done so for any goal."""
     batch = make_batch([[4]], terminated=True)
     batch["next", "reward"].fill_(-1.0)
-    rows = virtual_of(relabel(batch, reward=NEVER, k=2, achieved_reward=0.0, **options))
+    rows = virtual_of(relabel(batch, reward=NEVER, k=2, **options))
     at_end = rows["next", "observation"][:, 0] == 4
     assert at_end.any()
     for key in ("terminated", "done"):
@@ -290,7 +296,7 @@ def test_what_a_fall_cost_is_kept_for_other_goals(relabel: Relabel, options: dic
         rewards = NEVER(batch["next", "achieved_goal"], batch["next", "desired_goal"])[0]
         batch["next", "reward"] = rewards - torch.where(batch["next", "terminated"], cost, 0.0)
         torch.manual_seed(0)
-        drawn.append(virtual_of(relabel(batch, reward=NEVER, k=2, achieved_reward=0.0, **options)))
+        drawn.append(virtual_of(relabel(batch, reward=NEVER, k=2, **options)))
     free, dear = drawn
     assert torch.equal(free["desired_goal"], dear["desired_goal"])
     at_end = free["next", "observation"][:, :1] == 4

@@ -110,7 +110,7 @@ def test_refill_is_for_single_transitions() -> None:
 
 def test_virtual_transitions_of_whole_episodes_are_rewarded_with_their_own_info() -> None:
     rule, batch = costly([[3, 2]])
-    buffer = make_buffer(reward=rule, strategy="final", k=1, per="episode", achieved_reward=-0.9)
+    buffer = make_buffer(reward=rule, strategy="final", k=1, per="episode")
     buffer.extend(batch)
     real, virtual = split(buffer)
     assert real["next", "reward"].flatten().tolist() == [-1.25, -1.5, -1.75, -1.25, -1.5]
@@ -141,8 +141,10 @@ def test_the_filter_reads_the_info_of_the_state_before_the_action() -> None:
 def test_entries_of_the_root_are_read_where_next_lacks_them() -> None:
     batch, near = make_batch([[2]]), GoalReward(0.5)
     batch["action"] = torch.tensor([[[0.5], [0.25]]])
-    rule = EnvReward(lambda a, d, info: near(a, d)[0] - info["action"].abs(), info_keys=["action"])
-    buffer = make_buffer(reward=rule, strategy="final", k=1, achieved_reward=-0.9)
+    rule = EnvReward(
+        lambda a, d, info: near(a, d)[0] - info["action"].abs(), info_keys=["action"], achieved_reward=-0.9
+    )
+    buffer = make_buffer(reward=rule, strategy="final", k=1)
     buffer.extend(batch)
     assert split(buffer)[1]["next", "reward"].flatten().tolist() == [-1.5, -0.25]
 
@@ -682,11 +684,11 @@ def test_flat_rows_of_two_environments_without_ids_are_refused_at_once() -> None
 
 def test_a_success_with_another_reward_is_no_fall() -> None:
     """As with dense rewards: the reward function's end is that of the goal."""
-    dense = EnvReward(lambda a, d: REWARD(a, d)[0] - 0.1, lambda a, d: REWARD(a, d)[1])
+    dense = EnvReward(lambda a, d: REWARD(a, d)[0] - 0.1, lambda a, d: REWARD(a, d)[1], achieved_reward=0.0)
     batch = make_batch([[4]], terminated=True)
     batch["next", "reward"] -= 0.1
     batch["next", "desired_goal"][0, 3] = batch["next", "achieved_goal"][0, 3]
-    buffer = make_buffer(reward=dense, k=50, achieved_reward=0.0)
+    buffer = make_buffer(reward=dense, k=50)
     buffer.extend(batch)
     _, virtual = split(buffer)
     reached = virtual["next", "achieved_goal"][:, 0] == virtual["desired_goal"][:, 0]

@@ -46,7 +46,7 @@ def count_rows(
         real, virtual: the transitions that are written for the chunk; None without virtual ones.
         relabeled: for each run, the number of real transitions that got goals of their own episode.
     """
-    least = achieved_reward_of(chunk.reward_fn, chunk.options.achieved_reward)
+    least = achieved_reward_of(chunk.reward_fn)
     columns = {
         "real": real.counts,
         "relabeled": relabeled,
@@ -56,7 +56,7 @@ def count_rows(
         positive = useful = virtual.reward >= least
         if not chunk.options.filter_achieved:
             before = chunk.before()[virtual.root]
-            useful = positive & missed(chunk.reward_fn, before, virtual.changes[chunk.keys.goals[0]], least)
+            useful = positive & missed(chunk.reward_fn, before, virtual.changes[chunk.keys.goals[0]])
         columns["virtual"], columns["virtual_positive"] = virtual.counts, _set(positive, virtual.counts)
         columns["useful_virtual_positive"] = _set(useful, virtual.counts)
     return [

@@ -83,7 +83,7 @@ class Chunk:
 
     def failures(self) -> tuple[Tensor, Tensor]:
         """Returns ``(failed, cost)``, [n, 1] each; see :func:`~torchrl_her.replay_buffers.keys.failures`."""
-        return failures(self.rows, self.keys, self.reward_fn, self.options.achieved_reward)
+        return failures(self.rows, self.keys, self.reward_fn)
 
 
 def split_runs(

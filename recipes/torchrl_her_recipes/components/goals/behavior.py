@@ -74,7 +74,6 @@ def _goals(seeds: Sequence[int], env: EnvBase, **options: Any) -> BehaviorGoals:
         task_reward(env),
         runs=len(seeds),
         generators=generators_of(seeds, Stream.PROPOSED_GOALS),
-        achieved_reward=reward_range(goal_env(env))[1],
         continues_after_termination=goal_env(env).continues_after_termination,
         **options,
     )

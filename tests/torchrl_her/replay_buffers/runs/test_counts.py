@@ -15,10 +15,10 @@ from torchrl_her.replay_buffers.runs.written import WrittenRows
 ROWS = TensorDict({"achieved_goal": torch.arange(4.0).unsqueeze(-1)}, [4])
 
 
-def chunk(**options: object) -> Chunk:
+def chunk(*, least: float = 0.0, **options: object) -> Chunk:
     own = HindsightOptions().changed(options)
     piece = Piece([0, 1], Episodes(torch.arange(4).unsqueeze(-1), torch.ones(4, dtype=torch.int64)))
-    return Chunk(ROWS, None, piece, GoalReward(0.5), own, own.transition_keys())
+    return Chunk(ROWS, None, piece, GoalReward(0.5, achieved_reward=least), own, own.transition_keys())
 
 
 def written(reward: list[float], counts: list[int], goals: list[float] | None = None) -> WrittenRows:
@@ -30,7 +30,7 @@ def written(reward: list[float], counts: list[int], goals: list[float] | None = 
 def test_positive_is_what_has_the_reward_of_an_achieved_goal() -> None:
     real = written([0.0, -1.0, 1.0, -1.0, -0.5], [3, 2])
     for least, positive in ((0.0, [2, 0]), (-0.5, [2, 1])):
-        counted = count_rows(chunk(achieved_reward=least), real, None, [2, 1])
+        counted = count_rows(chunk(least=least), real, None, [2, 1])
         assert [counts.real_positive for counts in counted] == positive
         assert [(counts.real, counts.relabeled) for counts in counted] == [(3, 2), (2, 1)]
         assert WriterCounts.sum(counted).virtual == 0
