@@ -114,9 +114,10 @@ class Demonstrations:
         """Returns the episodes with the given numbers, in the given order.
 
         Args:
-            episodes: [m] int64, numbers of the episodes.
+            episodes: [m] int64, numbers of the episodes; or a mask [E] of bool, such as :attr:`achieved`.
         """
-        index = torch.as_tensor(episodes, dtype=torch.int64)
+        chosen = torch.as_tensor(episodes)
+        index = torch.arange(len(self))[chosen if chosen.dtype == torch.bool else chosen.long()]
         lengths, begins = self.lengths[index], self.begins[index]
         offset = torch.arange(int(lengths.sum())) - (lengths.cumsum(0) - lengths).repeat_interleave(lengths)
         return self.take(begins.repeat_interleave(lengths) + offset, lengths)
@@ -161,11 +162,11 @@ class Demonstrations:
         """Makes demonstrations from a rollout, environment by environment; unfinished episodes are truncated.
 
         Args:
-            rollout: [N, T], time last.
+            rollout: [N, T], time last; or [T].
 
         Keyword Args:
             first: whether only the first episode of each environment counts.
-            states: states of the environments before each step, [N, T, ...] each.
+            states: states of the environments before each step, [N, T, ...] each; or [T, ...].
             **facts: ``task``, ``made_by`` and ``achieved_reward``, as for the class.
 
         Raises:
@@ -178,11 +179,12 @@ class Demonstrations:
             )
         ends = rows["next", "done"].flatten().nonzero().flatten()
         lengths = torch.diff(ends, prepend=ends.new_tensor([-1]))
-        flat = None if states is None else {name: entry.flatten(0, 1) for name, entry in states.items()}
+        dim = rollout.ndim - 1  # of time
+        flat = None if states is None else {name: entry.flatten(0, dim) for name, entry in states.items()}
         demonstrations = cls(rows, lengths, states=flat, **facts)
         if not first:
             return demonstrations
-        env = demonstrations.begins // rollout.shape[1]
+        env = demonstrations.begins // rollout.shape[-1]
         return demonstrations.select((torch.diff(env, prepend=env.new_tensor([-1])) > 0).nonzero().flatten())
 
     @classmethod

@@ -43,6 +43,14 @@ def test_only_the_first_ones_with_their_states() -> None:
     assert own.states["place"].flatten().tolist() == [0, 1, 5, 6, 7, 8]
 
 
+def test_a_rollout_may_be_of_one_environment_without_a_batch() -> None:
+    place = torch.arange(5).unsqueeze(-1)
+    own = Demonstrations.from_rollout(make_batch([[2, 3]])[0], first=True, states={"place": place})
+    assert tags(own) == [0, 1]
+    assert own.states is not None
+    assert own.states["place"].flatten().tolist() == [0, 1]
+
+
 def test_an_episode_that_is_open_at_the_end_is_truncated_there() -> None:
     batch = make_batch([[9]], steps=4)
     own = Demonstrations.from_rollout(batch)
@@ -68,6 +76,12 @@ def test_episodes_are_chosen_with_their_states() -> None:
     assert own.states["place"].flatten().tolist() == tags(own)
     assert own.lengths.tolist() == [4, 3]
     assert tags(walks(3, 2, 4).first(2)) == [0, 1, 2, 100, 101]
+
+
+def test_episodes_are_chosen_by_a_mask() -> None:
+    own = walks(3, 2, 4, goal=102.0)
+    assert tags(own.select(own.achieved)) == [100, 101]
+    assert tags(own.select(~own.achieved)) == [0, 1, 2, 200, 201, 202, 203]
 
 
 @pytest.mark.parametrize("count", [0, 4])
