@@ -136,13 +136,18 @@ def as_critics(
 
 
 def connect_critics(loss: LossModule, critic: TensorDictModule | Sequence[TensorDictModule]) -> None:
-    """Sets the key of a loss's values, and copies the weights of a critic that came in a list of one.
+    """Sets a loss's keys of values and actions, and copies the weights of a critic in a list of one.
+
+    The action is the entry that the actor writes and the critic reads.
 
     Args:
         loss: loss that was made with the result of :func:`as_critics`.
         critic: critic or list of critics that the loss was made with.
     """
     loss.set_keys(state_action_value=loss.qvalue_network.out_keys[0])
+    actions = [key for key in loss.actor_network.out_keys if key in loss.qvalue_network.in_keys]
+    if len(actions) == 1:
+        loss.set_keys(action=actions[0])
     if isinstance(critic, TensorDictModule) or len(critic) > 1:
         return
     weights = TensorDict.from_module(critic[0]).data.unsqueeze(0)

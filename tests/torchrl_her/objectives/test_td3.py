@@ -135,3 +135,13 @@ def test_critics_of_a_list_are_taken_as_they_are() -> None:
     assert all(
         torch.equal(w, critic.module.first[0][0].weight) for w, critic in zip(weights, own, strict=True)
     )
+
+
+@pytest.mark.parametrize("key", ["move", ("agent", "move")])
+def test_actions_may_have_a_key_of_their_own(key: str | tuple[str, str]) -> None:
+    critics = [make_critic((4, 2), 3, action_key=key) for _ in range(2)]
+    loss = make_td3_loss(make_actor((4, 2), 3, action_key=key), critics, action_spec=SPEC)
+    SoftUpdate(loss, tau=0.1)
+    batch = rows(2, action=torch.rand(1, 2, 3))[0]
+    batch.rename_key_("action", key)
+    assert loss(batch)["loss_actor"].isfinite()
