@@ -215,7 +215,7 @@ class RunningNorm(nn.Module):
         new = [
             (self.moments_of(key, run), self._finite_moments(key, part))
             for key, values in entries.items()
-            for run, part in zip(runs, values.flatten(0, -2).split(shares), strict=True)
+            for run, part in zip(runs, values.reshape(-1, values.shape[-1]).split(shares), strict=True)
             if len(part) > 0
         ]
         for running, moments_of_part in new:

@@ -87,7 +87,8 @@ class NormalizeBatch(Transform):
             if not bool(achieved.isfinite().all()):
                 raise ValueError(f"{key!r} must be finite to be counted, got NaN or infinity in it")
             self.norm.update(tensordict)
-            for run, goals in enumerate(achieved.flatten(0, -2).chunk(self.norm.runs)):
+            goals_by_run = achieved.reshape(-1, achieved.shape[-1]).chunk(self.norm.runs)
+            for run, goals in enumerate(goals_by_run):
                 self.norm.count(self.keys.desired_goal, goals, run=run, weight=self.counted_k)
         return tensordict
 

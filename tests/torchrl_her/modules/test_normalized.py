@@ -103,6 +103,16 @@ def test_a_sample_unit_s_goals_are_normalized_and_achieved_ones_counted_k_times(
     assert torch.equal(buffer.storage[:]["desired_goal"], wanted)
 
 
+def test_a_transition_that_is_added_alone_is_counted() -> None:
+    norm, row = make_norm(), make_batch([[3]]).reshape(-1)[0]
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(100))
+    buffer.append_transform(NormalizeBatch(norm, counted_k=3))
+    buffer.add(row)
+    n, mean, _ = norm.moments_of("desired_goal")
+    assert n.tolist() == [4.0] * 2  # its desired goal, and three times its achieved one
+    torch.testing.assert_close(mean, ((row["desired_goal"] + 3 * row["next", "achieved_goal"]) / 4).double())
+
+
 def test_each_run_of_a_buffer_has_its_own_statistics() -> None:
     runs, capacity = 2, 300
     generators = [torch.Generator().manual_seed(seed) for seed in range(runs)]
