@@ -10,7 +10,7 @@ import yaml
 
 import torchrl_her_recipes as recipes  # imports torch only when one of its names is used
 from torchrl_her_recipes.cli.overrides import single
-from torchrl_her_recipes.cli.say import INTERRUPTED, exit_code, say_result, success_line
+from torchrl_her_recipes.cli.say import INTERRUPTED, command_line, exit_code, say_result, success_line
 from torchrl_her_recipes.cli.train_options import (
     OptionsCommand,
     complete,
@@ -18,7 +18,6 @@ from torchrl_her_recipes.cli.train_options import (
     requests,
     with_folder,
 )
-from torchrl_her_recipes.config.imports import imported_modules, needs_permission
 from torchrl_her_recipes.config.recipe import Recipe, check_extending
 from torchrl_her_recipes.config.resolve import SHAPING, auto_options, left_open
 
@@ -126,10 +125,8 @@ def _say_end(result: recipes.RunResult) -> int:
     assert result.folder is not None
     if result.interrupted:
         click.echo(f"interrupted: everything so far was saved in {result.folder}")
-        imports = "".join(f"--import {module} " for module in imported_modules())
         task = recipes.RunFolder(result.folder).recipe().task.name
-        allowed = " --allow-import" if needs_permission(task) else ""
-        click.echo(f"resume it with: torchrl-her {imports}train --resume {result.folder}{allowed}")
+        click.echo(f"resume it with: {command_line('train', '--resume', result.folder, task=task)}")
         return INTERRUPTED
     left = "" if result.reached == result.success else f", reached at some step {result.reached:.0%}"
     click.echo(f"{success_line(result.successes)}{left} in the last evaluation")

@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 import torchrl_her_recipes as recipes  # imports torch only when one of its names is used
 from torchrl_her_recipes.cli.overrides import single
-from torchrl_her_recipes.cli.say import exit_code, fail
+from torchrl_her_recipes.cli.say import command_line, exit_code, fail
 from torchrl_her_recipes.cli.train_options import complete, folder_option, label, with_folder
 from torchrl_her_recipes.config.presets import load_preset
 from torchrl_her_recipes.config.recipe import make_recipe
@@ -75,7 +75,7 @@ def tune(
     click.echo(f"varied: {', '.join(search.space.ranges)}")
     workers: Any = recipes.make_workers(jobs=jobs)
     result = recipes.tune(search, home, trials=trials, minutes=minutes, workers=workers, say=_say_trial)
-    return _say(result)
+    return _say(result, task=recipe.task.name)
 
 
 def _say_trial(line: str) -> None:
@@ -83,11 +83,12 @@ def _say_trial(line: str) -> None:
     sys.stdout.flush()  # so that the line appears at once if the output goes to a file
 
 
-def _say(result: SearchResult) -> int:
+def _say(result: SearchResult, *, task: str) -> int:
     for number, reason in result.failed.items():
         fail(f"trial {number} failed: {reason}")
     for line in recipes.search_summary(result.study):
         click.echo(line)
     if result.best is not None:
-        click.echo(f"the best: torchrl-her train preset={result.folder / 'best.yaml'}")
+        preset = f"preset={result.folder / 'best.yaml'}"
+        click.echo(f"the best: {command_line('train', preset, task=task)}")
     return exit_code(interrupted=result.interrupted, failed=result.best is None)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import statistics
 import time
 import warnings
@@ -397,7 +398,8 @@ class _Run:
             why = (error.strerror or str(error)).lower()
             raise OSError(
                 f"cannot write {error.filename or ' or '.join(missing)}: {why}; "
-                f"{', '.join(missing)} will be written by: torchrl-her train --resume {home.path}"
+                f"{', '.join(missing)} will be written by: torchrl-her train --resume "
+                f"{shlex.quote(str(home.path))}"
             ) from error
 
     def _draw(self, goals: GoalMap | None, home: RunFolder) -> None:

@@ -45,8 +45,12 @@ def test_a_search_says_what_it_varies_and_how_to_train_the_best(
 
     assert main(["train", "preset=runs/tune_bit_flip_s0/best.yaml", "--show"]) == 0
     assert "gamma: 0.95" in capsys.readouterr().out
-    said = refused(*command[:-1], "tpe")
-    assert "tune_bit_flip_s0 holds a search with --sampler=random, not --sampler=tpe" in said
+    Path("runs/tune_bit_flip_s0").rename("runs/mine, moved")
+    assert main([*command, "folder=runs/mine, moved"]) == 0
+    said = capsys.readouterr().out.splitlines()
+    assert said[-1] == "the best: torchrl-her train 'preset=runs/mine, moved/best.yaml'"
+    said = refused(*command[:-1], "tpe", "folder=runs/mine, moved")
+    assert "mine, moved holds a search with --sampler=random, not --sampler=tpe" in said
 
 
 def test_list_names_the_spaces(capsys: pytest.CaptureFixture[str]) -> None:
