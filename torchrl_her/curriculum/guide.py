@@ -143,7 +143,9 @@ class GuidedExploration(TensorDictModuleBase):
         runs = len(self.generators)
         learned = policy.state_dict()
         for name, tensor in self.module.state_dict().items():
-            tensor.chunk(runs)[run].copy_(learned[name].chunk(runs)[run])
+            # A single run's networks may have numbers without a dimension.
+            mine, new = (torch.atleast_1d(each).chunk(runs)[run] for each in (tensor, learned[name]))
+            mine.copy_(new)
         self.stage[run] = stage
 
     @torch.no_grad()

@@ -121,6 +121,15 @@ def test_it_follows_a_copy(guide: GuidedExploration) -> None:
     assert not any(weight.requires_grad for weight in guide.parameters())
 
 
+def test_a_weight_may_have_no_dimension() -> None:
+    learning = policy(1.0)
+    learning.module.scale = nn.Parameter(torch.tensor(2.0))
+    guide = GuidedExploration(learning, CURRICULUM)
+    learning.module.scale.data.fill_(5.0)
+    guide.follow(learning, 0)
+    assert guide.module.state_dict()["module.scale"].item() == 5.0
+
+
 def test_runs_are_guided_by_what_they_have_learned_themselves() -> None:
     guide = GuidedExploration(policy(1.0, 1.0, 1.0), CURRICULUM, share=1.0, runs=3)
     guide.follow(policy(5.0, 6.0, 7.0), 0, run=2)
