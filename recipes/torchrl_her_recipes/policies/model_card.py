@@ -65,6 +65,8 @@ def training_command(recipe: Recipe) -> str:
         'torchrl-her train task=hand_v1 algo=cher seed=3'
     """
     words, changed = [], recipe.changed()
+    if recipe.curriculum.stages is not None:
+        changed["curriculum"].pop("name", None)  # the file that the stages were read from
     for group, values in recipe.to_dict().items():
         for name, value in values.items():
             named = name == "name" and group in GROUPS

@@ -35,6 +35,13 @@ def test_the_command_trains_the_same_recipe(options: dict[str, Any]) -> None:
     assert make_recipe(**single(words)) == recipe
 
 
+def test_the_command_has_the_stages_in_place_of_their_file() -> None:
+    recipe = make_recipe(task="hand_v1", curriculum="panda_stack")
+    values = single(shlex.split(training_command(recipe))[2:])
+    assert make_recipe(**values).curriculum.stages == recipe.curriculum.stages
+    assert "curriculum" not in values
+
+
 @pytest.mark.parametrize("suffix", [pytest.param(".onnx", marks=needs_onnx), ".safetensors"])
 @pytest.mark.parametrize("options", [{}, {"task": "bit_flip", "learner": "dqn"}], ids=["hand", "bits"])
 def test_the_code_of_a_card_runs(
