@@ -32,7 +32,7 @@ def write(env: ThrowingEnv, episodes: TensorDictBase, at_once: int) -> tuple[flo
     weights = Instructiveness(
         GRID, partial(box_target, GRID, goals.low, goals.high), sigma=0.4, start_factor=1.0
     )
-    reward = EnvReward(env.compute_reward, env.compute_terminated)
+    reward = EnvReward.of(env)
     buffer = TensorDictReplayBuffer(
         storage=LazyTensorStorage(EPISODES * 300), writer=HERWriter(reward, weights=weights)
     )

@@ -86,7 +86,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     torch.set_num_threads(1)
     torch.manual_seed(0)
     env = make_env("hand_v1", num_envs=EPISODES, seed=0)
-    reward = EnvReward(env.compute_reward, env.compute_terminated)
+    reward = EnvReward.of(env)
     batch = move_balls(collect(env), env)
     stored = copies(batch, reward)
     plain = stored.exclude("virtual")

@@ -57,7 +57,7 @@ def collect(env: ThrowingEnv, runs: int) -> list[TensorDictBase]:
 
 
 def make_writer(env: ThrowingEnv, **options: Any) -> HERWriter:
-    reward = EnvReward(env.compute_reward, env.compute_terminated)
+    reward = EnvReward.of(env)
     return HERWriter(reward, k=4, filter_achieved=True, exclude=NOT_STORED, **options)
 
 

@@ -81,7 +81,7 @@ def make_buffer(writer: Writer) -> TensorDictReplayBuffer:
 def make_her(
     env: ThrowingEnv, *, filter_achieved: bool = False, weights: GoalWeights | None = None
 ) -> HERWriter:
-    reward = EnvReward(env.compute_reward, env.compute_terminated)
+    reward = EnvReward.of(env)
     return HERWriter(reward, k=K, filter_achieved=filter_achieved, weights=weights, exclude=NOT_STORED)
 
 

@@ -99,7 +99,7 @@ def make_buffer(env: EnvBase) -> TensorDictReplayBuffer:
         slice_len=STEPS, traj_key=("collector", "traj_ids"), strict_length=False, cache_values=True
     )
     writer = HERWriter(
-        EnvReward(env.compute_reward, env.compute_terminated),
+        EnvReward.of(env),
         per="episode",
         k=4,
         filter_achieved=True,

@@ -6,11 +6,12 @@ import inspect
 import math
 from collections.abc import Callable, Sequence
 from functools import reduce
-from typing import Any, Protocol, TypeAlias
+from typing import Any, Protocol, Self, TypeAlias
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from torch import Tensor
+from torchrl.envs import EnvBase
 
 from torchrl_her.checks import check_finite
 
@@ -159,6 +160,28 @@ class EnvReward:
         self.compute_terminated = compute_terminated
         self.info_keys = [unravel_key(key) for key in info_keys]
         self.achieved_reward = achieved_reward
+
+    @classmethod
+    def of(cls, env: EnvBase) -> Self:
+        """Returns the reward function of an environment.
+
+        Args:
+            env: environment with a method ``compute_reward``; a method ``compute_terminated`` and attributes
+                ``info_keys`` and ``achieved_reward`` are taken over if it has them.
+
+        Raises:
+            TypeError: the environment has no method ``compute_reward``.
+
+        Example:
+            >>> from torchrl_her_envs import make_env
+            >>> rule = EnvReward.of(make_env("hand_v1"))
+            >>> rule(torch.zeros(1, 2), torch.ones(1, 2))
+            (tensor([[-1.]]), tensor([[False]]))
+        """
+        if not hasattr(env, "compute_reward"):
+            raise TypeError(f"the environment must have a method compute_reward, got {type(env).__name__}")
+        others = ("compute_terminated", "info_keys", "achieved_reward")
+        return cls(env.compute_reward, **{name: getattr(env, name) for name in others if hasattr(env, name)})
 
     def __call__(
         self, achieved_goal: Tensor, desired_goal: Tensor, *info: TensorDictBase

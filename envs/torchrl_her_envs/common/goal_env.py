@@ -297,7 +297,7 @@ def needs_info(env: GoalEnv) -> str:
     """Returns the message for rewards that read info besides goals, if no info is given."""
     return (
         f"compute_reward of {env.task_name} reads {env.info_keys} of transitions: pass them, as in "
-        "EnvReward(env.compute_reward, env.compute_terminated, info_keys=env.info_keys)"
+        "EnvReward.of(env)"
     )
 
 

@@ -187,7 +187,7 @@ class GymGoalEnv(GoalEnv, GymWrapper):
 
     If the environment's functions read more than the goals, ``info_keys`` names the entries of ``info``. They
     become entries of transitions, ``("info", KEY)``, from which rewards of virtual goals are computed:
-    ``EnvReward(env.compute_reward, env.compute_terminated, info_keys=env.info_keys)``.
+    ``EnvReward.of(env)``.
 
     :func:`make_gym_env` makes such environments.
 

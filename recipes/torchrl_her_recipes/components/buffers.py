@@ -19,7 +19,7 @@ from torchrl_her.curriculum.normalization import count_inputs
 from torchrl_her.curriculum.transforms import ZeroPad
 from torchrl_her.curriculum.view import StageView
 from torchrl_her.env_keys import PROPOSED, PROPOSED_REACHED
-from torchrl_her.goals.rewards import RewardFunction
+from torchrl_her.goals.rewards import EnvReward, RewardFunction
 from torchrl_her.modules.normalization import RunningNorm
 from torchrl_her.modules.normalized import NormalizeBatch
 from torchrl_her.replay_buffers import PackedStorage, RunsPrioritizedSampler, RunsSampler
@@ -30,7 +30,6 @@ from torchrl_her.replay_buffers.writer import HERWriter
 from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_recipes.components.curricula import CurriculumState
 from torchrl_her_recipes.components.devices import ON_THE_CPU, Devices
-from torchrl_her_recipes.components.envs import task_reward
 from torchrl_her_recipes.components.goals.space import GoalSpace, KernelSpace
 from torchrl_her_recipes.config.groups import HindsightConfig, ReplayConfig
 from torchrl_her_recipes.config.recipe import Recipe
@@ -93,7 +92,7 @@ def make_buffer(
             weights=[weight for weight in weights if weight is not None] or None,
             runs=runs,
             generators=generators,
-            stages=_rules(state, task_reward(env)),
+            stages=_rules(state, EnvReward.of(env)),
             on_write=counted,
         ),
         sampler=_make_sampler(recipe.replay, recipe.learner.priority_power, generators, size, devices.replay),
@@ -114,7 +113,7 @@ def make_buffer(
 def _make_writer(options: HindsightConfig, env: EnvBase, **others: Any) -> HERWriter:
     algorithm = options.algorithm
     return HERWriter(
-        task_reward(env),
+        EnvReward.of(env),
         **_goals(options),
         n_steps=options.n_steps,
         filter_achieved=algorithm.filter,

@@ -15,8 +15,9 @@ from torchrl_her.curriculum.stages import Curriculum, CurriculumProgress, Curric
 from torchrl_her.curriculum.switch import set_stage_goals
 from torchrl_her.curriculum.transforms import StageOutcomes, StateToObs, ZeroPad
 from torchrl_her.demonstrations.starts import DemonstrationStarts
+from torchrl_her.goals.rewards import EnvReward
 from torchrl_her_envs.common.goal_env import GoalEnv, goal_env, reward_range
-from torchrl_her_recipes.components.envs import TaskEnvs, task_reward
+from torchrl_her_recipes.components.envs import TaskEnvs
 from torchrl_her_recipes.components.streams import Stream, generators_of
 from torchrl_her_recipes.config.choices.order import AllAtOnce, Order, Teacher, Threshold
 from torchrl_her_recipes.config.choices.weights import Equal, Weights
@@ -240,7 +241,7 @@ def in_stages(
     if begins:
         transforms.append(InitTracker())
     if isinstance(progress, EpisodeStages):
-        transforms.append(StageOutcomes(progress, reward_fn=task_reward(env)))
+        transforms.append(StageOutcomes(progress, reward_fn=EnvReward.of(env)))
     if starts is not None:
         transforms = [starts, *transforms, starts.outcomes()]
     return TransformedEnv(env, Compose(*transforms), auto_unwrap=True)

@@ -15,11 +15,12 @@ from torchrl_her.demonstrations.dataset import Demonstrations
 from torchrl_her.demonstrations.replay import MixedReplay, write_demonstrations
 from torchrl_her.demonstrations.shown import in_stage, with_reward
 from torchrl_her.demonstrations.starts import DemonstrationStarts
+from torchrl_her.goals.rewards import EnvReward
 from torchrl_her.objectives.cloning import Cloning
 from torchrl_her.trainers.checkpoint import buffer_state_dict, load_buffer_state_dict
 from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_recipes.components.curricula import CurriculumState
-from torchrl_her_recipes.components.envs import TaskEnvs, action_bounds, task_reward
+from torchrl_her_recipes.components.envs import TaskEnvs, action_bounds
 from torchrl_her_recipes.components.streams import Stream, generators_of
 from torchrl_her_recipes.config.groups import DemonstrationsConfig, HindsightConfig
 
@@ -44,7 +45,7 @@ class RunDemonstrations:
 
     def shown(self, run: int) -> Demonstrations:
         """Returns the demonstrations as seen in a run's stage, with the stage's goals and rewards."""
-        rule = task_reward(self.env)
+        rule = EnvReward.of(self.env)
         if self.state is None:
             return with_reward(self.recorded, rule)
         progress = self.state.progress

@@ -114,7 +114,7 @@ class TaskEnvs:
         if "termination" in get_task_spec(task.name).options and task.failure != "environment":
             missed = reward_range(goal_env(env))[0]
             worth = missed / (1 - self.gamma) if task.failure == "never_pays" else None
-            transforms.append(Failures(worth, task_reward(env)))
+            transforms.append(Failures(worth, EnvReward.of(env)))
         low, high = action_bounds(env)
         if not (low.eq(-1).all() and high.eq(1).all()):
             transforms.append(ActionScaling())
@@ -131,14 +131,3 @@ def action_bounds(env: EnvBase) -> tuple[Tensor, Tensor]:
         return actions.low, actions.high
     one = torch.ones(actions.shape, device=actions.device)
     return -one, one
-
-
-def task_reward(env: EnvBase) -> EnvReward:
-    """Returns the reward function of a task's environment, ignoring any transforms around it."""
-    task = goal_env(env)
-    return EnvReward(
-        task.compute_reward,
-        task.compute_terminated,
-        info_keys=task.info_keys,
-        achieved_reward=task.achieved_reward,
-    )

@@ -12,10 +12,10 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_her.goals.rewards import Outcome, ask_reward, is_achieved, missed, outcomes
+from torchrl_her.goals.rewards import EnvReward, Outcome, ask_reward, is_achieved, missed, outcomes
 from torchrl_her_envs.common.goal_env import GoalEnv, goal_env
 from torchrl_her_envs.common.goal_rules import GoalEnds, say_once
-from torchrl_her_recipes.components.envs import TaskEnvs, action_bounds, task_reward
+from torchrl_her_recipes.components.envs import TaskEnvs, action_bounds
 from torchrl_her_recipes.config.options import AUTO
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.config.resolve import TERMINATION, EnvFacts, auto_options, left_open, resolve
@@ -184,7 +184,7 @@ def _facts(
     played: list[TensorDictBase], task: GoalEnv, seconds: float, actions: list[tuple[float, float]] | None
 ) -> Facts:
     rows = cast(TensorDictBase, torch.cat(cast(list[Tensor], played)))
-    rule = task_reward(task)
+    rule = EnvReward.of(task)
 
     def meets(achieved: Outcome, desired: Tensor) -> Tensor:
         """Returns whether goals are achieved, [...] of bool."""

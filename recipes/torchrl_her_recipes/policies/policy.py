@@ -16,13 +16,14 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
+from torchrl_her.goals.rewards import EnvReward
 from torchrl_her.modules.networks import take_run
 from torchrl_her.trainers.metrics import reached, success
 from torchrl_her.trainers.trainer import evaluate
 from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_recipes.components.agents import find_learner, shape_of
 from torchrl_her_recipes.components.curricula import make_curriculum
-from torchrl_her_recipes.components.envs import TaskEnvs, evaluation_envs, play_episodes, task_reward
+from torchrl_her_recipes.components.envs import TaskEnvs, evaluation_envs, play_episodes
 from torchrl_her_recipes.config.imports import permit_task
 from torchrl_her_recipes.config.plain_files import naming
 from torchrl_her_recipes.config.policy_header import POLICY_SUFFIX
@@ -226,7 +227,7 @@ class Policy(TensorDictModuleBase):
         with closing(self.envs(evaluation_envs(self.info.task, episodes), seed=seed)) as env:
             rollout = play_episodes(env, self, episodes)
             at_last, at_some = (
-                metric(rollout, task_reward(env)).double().mean() for metric in (success, reached)
+                metric(rollout, EnvReward.of(env)).double().mean() for metric in (success, reached)
             )
         return float(at_last), float(at_some)
 

@@ -9,12 +9,13 @@ from torchrl.envs import EnvBase
 
 from torchrl_her.curriculum.normalization import restart_inputs
 from torchrl_her.curriculum.switch import enter_stage
+from torchrl_her.goals.rewards import EnvReward
 from torchrl_her.trainers.metrics import at_the_end, success
 from torchrl_her_envs.common.goal_env import goal_env
 from torchrl_her_recipes.components.assembly import eval_seeds
 from torchrl_her_recipes.components.components import Components
 from torchrl_her_recipes.components.curricula import CurriculumState
-from torchrl_her_recipes.components.envs import play_episodes, task_reward
+from torchrl_her_recipes.components.envs import play_episodes
 
 
 def play_greedily(components: Components, env: EnvBase, epoch: int) -> TensorDictBase:
@@ -29,7 +30,7 @@ def stage_success(
 ) -> Tensor:
     """Returns success [R, n] at goals of each run's stage; ``rollout`` has episodes of the full task."""
     runs, last = components.recipe.run.num_runs, len(state.curriculum) - 1
-    full = success(rollout, task_reward(components.eval_env)).float().view(runs, -1)
+    full = success(rollout, EnvReward.of(components.eval_env)).float().view(runs, -1)
     below = state.progress.stage < last
     if state.stage_env is None or not bool(below.any()):
         return full

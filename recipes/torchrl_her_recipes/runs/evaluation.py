@@ -11,11 +11,11 @@ from torch import Tensor
 
 from torchrl_her.goals.ibs import GoalHistogram
 from torchrl_her.goals.instructive import InstructiveWeights
+from torchrl_her.goals.rewards import EnvReward
 from torchrl_her.objectives.critics import critic_value
 from torchrl_her.trainers.metrics import discounted_return, final_distance, q_bias, reached, success
 from torchrl_her_recipes.components.components import Components
 from torchrl_her_recipes.components.devices import place_of
-from torchrl_her_recipes.components.envs import task_reward
 from torchrl_her_recipes.runs.notices import saturation
 
 
@@ -27,7 +27,7 @@ def measure(components: Components, rollout: TensorDictBase) -> dict[str, Tensor
     :func:`~torchrl_her.objectives.critic_value`. ``q_bias`` is ``q`` minus the discounted return of the
     episode. Both are missing if the loss has no critics with a value of one number.
     """
-    recipe, rule = components.recipe, task_reward(components.eval_env)
+    recipe, rule = components.recipe, EnvReward.of(components.eval_env)
     succeeded = success(rollout, rule)
     # After truncation, an episode is assumed to stay at its goal if it is there, and else never to reach it.
     missed, achieved = components.rewards

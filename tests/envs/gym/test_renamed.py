@@ -70,13 +70,7 @@ gymnasium.register(CRANE, Crane, max_episode_steps=6)
 def relabeled(env: GymGoalEnv) -> Any:
     torch.manual_seed(0)
     batch = env.rollout(60, break_when_any_done=False)
-    rule = EnvReward(
-        env.compute_reward,
-        env.compute_terminated,
-        info_keys=env.info_keys,
-        achieved_reward=env.achieved_reward,
-    )
-    writer = HERWriter(rule, k=4, strategy="episode")
+    writer = HERWriter(EnvReward.of(env), k=4, strategy="episode")
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(2_000), writer=writer)
     buffer.extend(batch)
     env.close()

@@ -70,7 +70,7 @@ def everything(rows: TensorDictBase) -> Tensor:
 
 def relabelled(env: ToyEnv, steps: TensorDictBase, **options: object) -> tuple[TensorDict, TensorDict]:
     """The real and the virtual rows."""
-    rule = EnvReward(env.compute_reward, env.compute_terminated)
+    rule = EnvReward.of(env)
     buffer = TensorDictReplayBuffer(
         storage=LazyTensorStorage(5000), writer=HERWriter(rule, k=4, **options), batch_size=32
     )

@@ -9,11 +9,15 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torchrl.envs import StepCounter, TransformedEnv
 
 from torchrl_her import EnvReward, GoalReward
 from torchrl_her.goals import achieved, distance
 from torchrl_her.goals.rewards import ask_reward, missed
+
+from ..behavior.line import Line
 
 
 def goals(*rows: list[float]) -> Tensor:
@@ -64,6 +68,25 @@ def test_reward_has_the_type_of_the_goals() -> None:
 def test_a_threshold_must_be_positive(threshold: float) -> None:
     with pytest.raises(ValueError, match=f"threshold must be positive and finite, got {threshold}"):
         GoalReward(threshold)
+
+
+class Paid(Line):
+    """Being at the goal is worth 1, less a cost; the episode goes on there."""
+
+    achieved_reward = 1.0
+    info_keys = ("cost",)
+
+    def compute_reward(self, achieved: Tensor, desired: Tensor, info: TensorDictBase) -> Tensor:
+        return (achieved == desired).float() - info["cost"]
+
+
+def test_an_environment_s_reward_is_found_below_transforms() -> None:
+    rule = EnvReward.of(TransformedEnv(Paid(), StepCounter()))
+    assert (rule.achieved_reward, rule.info_keys) == (1.0, ["cost"])
+    info = TensorDict({"cost": torch.tensor([[0.5]])}, [1])
+    assert [answer.tolist() for answer in rule(goals([1.0]), goals([1.0]), info)] == [[[0.5]], [[False]]]
+    with pytest.raises(TypeError, match="must have a method compute_reward, got Line"):
+        EnvReward.of(Line())
 
 
 @pytest.mark.parametrize("reward", [math.nan, math.inf])

@@ -17,9 +17,9 @@ from torchrl_her.behavior import (
     ValueCutoff,
 )
 from torchrl_her.curriculum.transforms import ZeroPad
+from torchrl_her.goals.rewards import EnvReward
 from torchrl_her_envs.common.goal_env import goal_env, reward_range
 from torchrl_her_recipes.components.curricula import CurriculumState, at_the_top
-from torchrl_her_recipes.components.envs import task_reward
 from torchrl_her_recipes.components.goals.space import GoalSpace, KernelSpace
 from torchrl_her_recipes.components.goals.weights import make_instructive
 from torchrl_her_recipes.components.learner import Agent
@@ -71,7 +71,7 @@ def make_asking(seeds: Sequence[int], env: EnvBase, *, memory: int) -> BehaviorG
 
 def _goals(seeds: Sequence[int], env: EnvBase, **options: Any) -> BehaviorGoals:
     return BehaviorGoals(
-        task_reward(env),
+        EnvReward.of(env),
         runs=len(seeds),
         generators=generators_of(seeds, Stream.PROPOSED_GOALS),
         continues_after_termination=goal_env(env).continues_after_termination,
