@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from operator import is_not
 from typing import Any
 
 import torch
@@ -58,31 +59,28 @@ class FusedWeights:
             ),
             *((tensor, delayed, 0, 1) for tensor, delayed in temperature),
         ]
-        self._memory: list[tuple[int, list[Tensor]]] = []  # addresses from which the table was made
+        self._weights = [tensor for place in self._places for tensor in place[:2] if tensor is not None]
+        # Addresses and states of Adam from which the table was made.
+        self._addresses: list[int] = []
+        self._moments: list[Tensor] = []
         self._table: Any = None
 
     def table(self) -> Any:
-        """Returns the addresses of all tensors, updated if loading a checkpoint has replaced some.
+        """Returns the addresses of all tensors, updated if some of them were replaced, as by a checkpoint.
 
         Raises:
             ValueError: tensors do not fit each other, are not contiguous, not on the CPU or of another type
                 than when the learner was made; or Adam's counts of steps differ.
         """
         states = [self._optimizer.state[parameter] or self._start(parameter) for parameter in self.parameters]
-        if not self._memory or not all(
-            parameter.data_ptr() == address
-            and all(state[name] is kept for name, kept in zip(_STATE, tensors, strict=True))
-            for parameter, state, (address, tensors) in zip(
-                self.parameters, states, self._memory, strict=True
-            )
-        ):
+        addresses = [tensor.data_ptr() for tensor in self._weights]
+        moments = [state[name] for state in states for name in _STATE]
+        if addresses != self._addresses or any(map(is_not, moments, self._moments)):
             for state in states:
                 state["step"] = state["step"].to(torch.float32)  # made as float64 if that is torch's default
             self._check(states)
-            self._memory = [
-                (parameter.data_ptr(), [state[name] for name in _STATE])
-                for parameter, state in zip(self.parameters, states, strict=True)
-            ]
+            self._addresses = addresses
+            self._moments = [state[name] for state in states for name in _STATE]
             rows = [self._row(*place) for place in self._places]
             kind = self._kinds.tensors
             self._table = (kind * len(rows))(*(kind(*row) for row in rows))

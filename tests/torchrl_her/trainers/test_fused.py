@@ -277,6 +277,16 @@ def test_a_checkpoint_in_between_changes_nothing(algorithm: str) -> None:
     assert second.optimizer.state_dict()["state"][0]["step"] == 4
 
 
+@pytest.mark.parametrize("algorithm", ["td3", "normalized"])
+def test_targets_may_be_replaced(algorithm: str) -> None:
+    first, second = both(make_loss(algorithm))
+    for learner in (first, second):
+        learner.update(make_rows(algorithm, (1, 8)))
+        for tensor in learner.loss.target_actor_network_params.values(True, True):
+            tensor.data = 0.9 * tensor
+    check_equal(first, second, lambda seed: make_rows(algorithm, (1, 8), seed), 1)
+
+
 def test_numbers_may_change_during_training() -> None:
     first, second = both(make_loss("ddpg"))
     for learner in (first, second):
