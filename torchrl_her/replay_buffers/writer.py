@@ -348,23 +348,29 @@ class HERWriter(StateFile, HindsightBase, RoundRobinWriter):
         Episodes that were held back continue if the collector's state is restored, too
         (:func:`~torchrl_her.trainers.load_collector_state_dict`). They end if the next transitions do not
         continue them.
+
+        Raises:
+            ValueError: the state has another number of runs, stages or weights.
         """
-        if len(state_dict["cursors"]) != self.runs:
-            raise ValueError(f"the state must have {self.runs} runs, got {len(state_dict['cursors'])}")
+        weights, recent = state_dict["weights"], state_dict["recent"]
+        for name, own, saved in (
+            ("runs", self.runs, state_dict["cursors"]),
+            ("stages", len(self._recent), recent),
+            ("weights", len(self.goal_weights), weights),
+        ):
+            if len(saved) != own:
+                raise ValueError(f"the state must have {own} {name}, got {len(saved)}")
         super().load_state_dict(state_dict)
         self._rings.cursors, self._rings.sizes = list(state_dict["cursors"]), list(state_dict["sizes"])
         self._held = Batch.from_state(state_dict, runs=self.runs)
-        recent = state_dict["recent"]
-        if len(recent) != max(1, len(self.stages)):
-            raise ValueError(f"the state must have {max(1, len(self.stages))} stages, got {len(recent)}")
         self._recent = [RecentGoals.from_state(saved) for saved in recent]
         self._episodes, self._all_over = state_dict["episodes"], state_dict["all_over"]
         self._loaded = True
         self._counts, self._totals = (
             [WriterCounts(**run_counts) for run_counts in state_dict[name]] for name in ("counts", "totals")
         )
-        for weights, saved in zip(self.goal_weights, state_dict["weights"], strict=False):
-            weights.load_state_dict(saved)
+        for own_weights, state in zip(self.goal_weights, weights, strict=True):
+            own_weights.load_state_dict(state)
 
     def _empty(self, empty_write_count: bool = True) -> None:
         super()._empty(empty_write_count)

@@ -361,6 +361,16 @@ def test_a_file_carries_held_back_episodes_counts_and_weights(tmp_path: Path) ->
     assert tags(held) == [tag(0, 1, t) for t in range(9)]
 
 
+def test_a_state_with_other_weights_is_refused_before_anything_is_read() -> None:
+    first, second = make_buffer(weights=CountingWeights()), make_buffer()
+    first.extend(make_batch([[3, 9]], steps=5))
+    with pytest.raises(ValueError, match="the state must have 0 weights, got 1"):
+        second.writer.load_state_dict(first.writer.state_dict())
+    assert (second.writer.held_back, second.writer.counts.real) == (0, 0)
+    with pytest.raises(ValueError, match="the state must have 1 weights, got 0"):
+        first.writer.load_state_dict(second.writer.state_dict())
+
+
 def test_held_back_episodes_end_where_a_new_collector_begins_anew() -> None:
     """Its trajectories are counted from 0 again, so ids do not tell."""
     first, second = make_buffer(strategy="final"), make_buffer(strategy="final")
