@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import click
-import yaml
 
 import torchrl_her_recipes as recipes  # imports torch only when one of its names is used
 from torchrl_her_recipes.cli.say import file_name
 from torchrl_her_recipes.cli.train_options import OptionsCommand, complete, requests
+from torchrl_her_recipes.config.plain_files import dump_yaml
 
 
 @click.command(cls=OptionsCommand, short_help="play random actions on a task, and suggest options")
@@ -28,7 +28,7 @@ def check(options: tuple[str, ...], steps: int) -> int:
     lines = recipes.advice(facts, recipe, str(file))
     if any(str(file) in line for line in lines):
         if not file.exists():
-            file.write_text(yaml.safe_dump(facts.stages, sort_keys=False, default_flow_style=None))
+            file.write_text(dump_yaml(facts.stages, default_flow_style=None))
         click.echo(f"  stages                {file}")
     click.echo("")
     click.echo("\n".join(f"- {line}" for line in lines) or "no obstacle to learning was found")

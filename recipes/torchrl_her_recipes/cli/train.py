@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import click
-import yaml
 
 import torchrl_her_recipes as recipes  # imports torch only when one of its names is used
 from torchrl_her_recipes.cli.overrides import single
@@ -18,6 +17,7 @@ from torchrl_her_recipes.cli.train_options import (
     requests,
     with_folder,
 )
+from torchrl_her_recipes.config.plain_files import dump_yaml
 from torchrl_her_recipes.config.recipe import Recipe, check_extending
 from torchrl_her_recipes.config.resolve import SHAPING, auto_options, left_open
 
@@ -61,7 +61,7 @@ def train(
         return _say_end(recipes.resume(resume, options=changes))
     runs = requests(options, multirun=multirun)  # all recipes are checked before the first run starts
     if show:
-        documents = [yaml.safe_dump(recipe.to_dict(), sort_keys=False) for recipe in runs.values()]
+        documents = [dump_yaml(recipe.to_dict()) for recipe in runs.values()]
         click.echo("---\n".join(documents), nl=False)
         return 0
     if multirun:

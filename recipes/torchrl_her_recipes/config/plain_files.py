@@ -89,9 +89,17 @@ class _Loader(yaml.SafeLoader):
         return node
 
 
+class _Dumper(yaml.SafeDumper):
+    """YAML dumper of text that :class:`_Loader` reads as it was."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+
 # Numbers such as 1e-3, which YAML 1.1 reads as text unless they are written 1.0e-3.
 _SHORT_FLOAT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$")
-_Loader.add_implicit_resolver("tag:yaml.org,2002:float", _SHORT_FLOAT, list("-+.0123456789"))
+for _kind in (_Loader, _Dumper):
+    _kind.add_implicit_resolver("tag:yaml.org,2002:float", _SHORT_FLOAT, list("-+.0123456789"))
 
 
 def parse_yaml(text: str) -> Any:
@@ -118,6 +126,20 @@ def parse_yaml(text: str) -> Any:
     except _DAMAGE as error:
         problem = reason(error) if isinstance(error, ValueError) else f"no value ({type(error).__name__})"
         raise ValueError(problem) from error
+
+
+def dump_yaml(value: Any, **style: Any) -> str:
+    """Formats plain values as YAML that :func:`parse_yaml` reads as it was.
+
+    Args:
+        value: plain values.
+        **style: arguments of ``yaml.dump``.
+
+    Example:
+        >>> dump_yaml({"b": 1, "a": ["1e3", 1e-3]}, default_flow_style=True)
+        "{b: 1, a: ['1e3', 0.001]}\\n"
+    """
+    return yaml.dump(value, Dumper=_Dumper, sort_keys=False, **style)
 
 
 def read_yaml(path: Path) -> Any:

@@ -7,11 +7,11 @@ import shlex
 from pathlib import Path
 from typing import Any
 
-import yaml
 from jinja2 import Environment, StrictUndefined
 
 from torchrl_her.files.writing import write_text
 from torchrl_her_envs.registry import get_task_spec
+from torchrl_her_recipes.config.plain_files import dump_yaml
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.config.shortcuts import GROUPS, locate
 from torchrl_her_recipes.policies.info import PolicyInfo
@@ -86,7 +86,7 @@ def _short(group: str, name: str) -> str:
 
 def _text(value: Any) -> str:
     """Formats a value as YAML on one line."""
-    text = yaml.safe_dump(value, default_flow_style=True, width=1 << 20).strip()
+    text = dump_yaml(value, default_flow_style=True, width=1 << 20).strip()
     return text.removesuffix("...").strip()
 
 

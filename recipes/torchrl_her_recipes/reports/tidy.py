@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import yaml
 
 from torchrl_her_recipes.config.plain_files import (
     LARGEST_TABLE,
+    dump_yaml,
     naming,
     number,
     read_json,
@@ -129,7 +129,7 @@ def write_files(about: Mapping[str, Any], cells: Sequence[Combination], out: Pat
     states = {cell.label: {name: getattr(cell, name) for name in _KEPT} for cell in cells}
     # Converted through JSON, since PyYAML's safe_dump refuses numpy's numbers and subclasses of dict.
     plain = json.loads(json.dumps({**about, "combinations": states}, default=np.generic.item))
-    text = yaml.safe_dump(plain, sort_keys=False, allow_unicode=True, width=110)
+    text = dump_yaml(plain, allow_unicode=True, width=110)
     # Written last: a folder with this file counts as results.
     (out / _ABOUT).write_text(text, encoding="utf-8")
     return out

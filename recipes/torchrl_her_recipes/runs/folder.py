@@ -12,12 +12,11 @@ from contextlib import contextmanager, suppress
 from importlib.metadata import version
 from pathlib import Path
 
-import yaml
 from filelock import FileLock, Timeout
 
 from torchrl_her.files.writing import part_of, write_text, written
 from torchrl_her_recipes.config.imports import foreign_module, permit_task
-from torchrl_her_recipes.config.plain_files import naming, read_json, read_mapping, read_table
+from torchrl_her_recipes.config.plain_files import dump_yaml, naming, read_json, read_mapping, read_table
 from torchrl_her_recipes.config.policy_header import POLICY_SUFFIX
 from torchrl_her_recipes.config.recipe import Recipe
 
@@ -117,7 +116,7 @@ class RunFolder:
             "versions": {name: version(name) for name in _PACKAGES},
         }
         write_text(self.about, json.dumps(about, indent=2) + "\n")
-        write_text(self.config, yaml.safe_dump(recipe.to_dict(), sort_keys=False))
+        write_text(self.config, dump_yaml(recipe.to_dict()))
         remember(self.config, recipe.task.name)
 
     def describe_best(self, epoch: int, success: float) -> None:

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from matplotlib import rc_context
 from optuna.importance import get_param_importances
 from optuna.study import Study, create_study
@@ -18,6 +17,7 @@ from optuna.trial import FrozenTrial, Trial, TrialState
 from optuna.visualization import matplotlib as figures
 
 from torchrl_her.files.writing import write_text
+from torchrl_her_recipes.config.plain_files import dump_yaml
 from torchrl_her_recipes.config.searches.search import Search
 from torchrl_her_recipes.runs.plots import save_figure
 
@@ -60,7 +60,7 @@ def write_results(search: Search, study: Study, trials: Sequence[FrozenTrial], f
         best = study.best_trial
         recipe = search.space.recipe(search.recipe, best.params)
         about = f"# trial {best.number} of the search in {folder.name}: score {best.value:.3f}\n"
-        write_text(folder / "best.yaml", about + yaml.safe_dump(recipe.changed(), sort_keys=False))
+        write_text(folder / "best.yaml", about + dump_yaml(recipe.changed()))
 
 
 def importances(study: Study) -> dict[str, float]:

@@ -13,7 +13,6 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import optuna
-import yaml
 from filelock import FileLock, Timeout
 from optuna.exceptions import OptunaError
 from optuna.storages import RDBStorage
@@ -25,7 +24,7 @@ from tqdm import tqdm
 from torchrl_her.files.writing import write_text
 from torchrl_her_recipes.components.first_look import resolved
 from torchrl_her_recipes.config.imports import check_permitted
-from torchrl_her_recipes.config.plain_files import naming, parse_yaml, read_mapping
+from torchrl_her_recipes.config.plain_files import dump_yaml, naming, parse_yaml, read_mapping
 from torchrl_her_recipes.config.searches.search import Search, difference
 from torchrl_her_recipes.runs.callbacks import Callback, RunView
 from torchrl_her_recipes.runs.folder import RunFolder
@@ -138,7 +137,7 @@ def tune(
 
 def _describe(search: Search, path: Path) -> None:
     """Writes the settings of a new search; raises a ValueError if its folder has other settings."""
-    text = yaml.safe_dump(search.to_plain(), sort_keys=False)
+    text = dump_yaml(search.to_plain())
     if not path.exists():
         write_text(path, text)
         return

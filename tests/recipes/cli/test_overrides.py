@@ -5,8 +5,19 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from torchrl_her_recipes.cli.overrides import parse_overrides, parse_value, split_sweep, sweep
+from torchrl_her_recipes.config.plain_files import dump_yaml, parse_yaml
+
+_PLAIN = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text()
+_TRICKY = st.from_regex(r"[-+.0-9]{1,3}[eE][-+0-9]{1,3}", fullmatch=True)
+
+
+@given(st.recursive(_PLAIN | _TRICKY, lambda own: st.lists(own) | st.dictionaries(st.text() | _TRICKY, own)))
+def test_what_is_written_as_yaml_is_read_as_it_was(value: Any) -> None:
+    assert parse_yaml(dump_yaml([value, value])) == [value, value]
 
 
 @pytest.mark.parametrize(
