@@ -31,10 +31,11 @@ class RewardFunction(Protocol):
     ``info_keys`` gets a third argument, the info: a tensordict of these entries of the transition, whose
     dimensions [...] are broadcast against those of the goals. Entries are read under ``next``, or in the root
     if ``next`` lacks them, as it lacks ``action``. When the relabeling filter calls the function for goals
-    that were achieved before the action, entries are read in the root first. A goal is achieved
-    if its reward is at least ``achieved_reward``, if the function has this attribute and it is not None, or
-    else 0. A transition that terminated with a lower reward failed, such as by a fall: relabeled, it also
-    terminates, with the same cost.
+    that were achieved before the action, entries are read in the root first.
+
+    A goal is achieved if its reward is at least ``achieved_reward``, an attribute that the function may have;
+    without it, or if it is None, at least 0. A transition that terminated with a lower reward failed, such as
+    by a fall; for other goals it terminates, too, at the same cost.
     """
 
     def __call__(self, achieved_goal: Tensor, desired_goal: Tensor, /) -> tuple[Tensor, Tensor]: ...

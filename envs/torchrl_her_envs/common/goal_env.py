@@ -296,8 +296,8 @@ def info_rows(transitions: TensorDictBase, names: Iterable[str], shape: torch.Si
 def needs_info(env: GoalEnv) -> str:
     """Returns the message for rewards that read info besides goals, if no info is given."""
     return (
-        f"compute_reward of {env.task_name} reads {env.info_keys} of transitions: pass them, as in "
-        "EnvReward.of(env)"
+        f"compute_reward of {env.task_name} reads {env.info_keys} of transitions: pass them, as "
+        "EnvReward.of(env) does"
     )
 
 

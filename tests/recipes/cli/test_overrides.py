@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchrl_her_recipes.cli.overrides import parse_overrides, parse_value, split_sweep, sweep
@@ -16,6 +16,7 @@ _TRICKY = st.from_regex(r"[-+.0-9]{1,3}[eE][-+0-9]{1,3}", fullmatch=True)
 
 
 @given(st.recursive(_PLAIN | _TRICKY, lambda own: st.lists(own) | st.dictionaries(st.text() | _TRICKY, own)))
+@settings(max_examples=30)
 def test_what_is_written_as_yaml_is_read_as_it_was(value: Any) -> None:
     assert parse_yaml(dump_yaml([value, value])) == [value, value]
 
