@@ -195,7 +195,8 @@ class RunsPrioritizedSampler(_BlockSampler, PrioritizedSampler):
         """Makes the trees; called by TorchRL's constructor."""
         self._trees = SumTrees(self.capacity, runs=self.runs, device=self.device)
         self._sizes = torch.zeros(self.runs, dtype=torch.int64, device=self.device)
-        self._most = torch.ones(self.runs, device=self.device)  # the largest priority of each run
+        # The largest priority of each run.
+        self._most = torch.ones(self.runs, dtype=torch.float32, device=self.device)
         self._warned: set[int] = set()  # runs that had priorities that are not finite
 
     @property

@@ -54,7 +54,8 @@ class SumTrees:
         tops = -(-capacity // _FAN**height)
         try:
             self._levels = [
-                torch.zeros(runs, tops * _FAN**level, device=device) for level in range(height, -1, -1)
+                torch.zeros(runs, tops * _FAN**level, dtype=torch.float32, device=device)
+                for level in range(height, -1, -1)
             ]
         except RuntimeError as error:  # torch raises a RuntimeError in place of a MemoryError
             raise MemoryError(f"there is not enough memory for {runs} x {capacity:,} priorities") from error
@@ -115,7 +116,7 @@ class SumTrees:
         sums = top.double().cumsum(-1)
         mass = u * sums[:, -1:]
         if (native := self._native()) is not None:
-            leaf, value = torch.empty(u.shape, dtype=torch.int64), torch.empty(u.shape)
+            leaf, value = (torch.empty(u.shape, dtype=dtype) for dtype in (torch.int64, torch.float32))
             pointers = (mass.data_ptr(), leaf.data_ptr(), value.data_ptr())
             native.her_trees_draw(*self._pointers(), u.shape[1], *pointers)
             return leaf.clamp_max_(self.capacity - 1), value

@@ -120,6 +120,21 @@ def test_rows_are_drawn_by_priority_and_weighted_as_torchrl_does() -> None:
     assert info["priority_weight"].max() == 1.0
 
 
+def test_torchs_default_dtype_makes_no_difference() -> None:
+    draws = []
+    try:
+        for dtype in (torch.float32, torch.float64):
+            torch.set_default_dtype(dtype)
+            sampler = make("prioritized")
+            sampler.mark_update(rows(10, 40, 1))
+            sampler.update_priority(rows(10, 40, 1), torch.arange(1, 52))
+            index, info = sampler.sample(storage(), 3 * 8)
+            draws.append((index, info["priority_weight"]))
+    finally:
+        torch.set_default_dtype(torch.float32)
+    assert all(map(torch.equal, *draws))
+
+
 def test_the_sign_of_a_priority_does_not_matter_and_minus_one_is_no_row() -> None:
     sampler = make("prioritized", 1, generators=None)
     sampler.mark_update(torch.arange(3))
