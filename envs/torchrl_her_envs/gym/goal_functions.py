@@ -200,6 +200,8 @@ class ShapedReward:
 
     def bonus(self, achieved: np.ndarray, desired: np.ndarray, reward: np.ndarray) -> np.ndarray:
         """Returns what is added to the sparse rewards [B] of goals [B, g]: 0 where they are achieved."""
-        distance = np.linalg.norm(achieved - desired, axis=-1).clip(self._near, self._far)
+        # Goals of unsigned whole numbers would wrap around below 0.
+        gap = np.subtract(achieved, desired, dtype=np.result_type(achieved, desired, np.float32))
+        distance = np.linalg.norm(gap, axis=-1).clip(self._near, self._far)
         share = np.log(self._far / distance) / np.log(self._far / self._near)
         return self._gain * np.where(reward < self._achieved, share.clip(0, _MOST), 0)

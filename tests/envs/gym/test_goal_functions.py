@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from torchrl_her_envs.gym.goal_functions import GoalFunction
+from torchrl_her_envs.gym.goal_functions import GoalFunction, ShapedReward
 
 MET = np.zeros((4, 3)), np.array([[9.0, 0.0, 0.0], [0.0] * 3, [0.0] * 3, [0.0] * 3])
 
@@ -108,3 +108,14 @@ def test_keys_that_are_asked_for_in_vain_are_noticed() -> None:
         lambda a, d, info: [0.0 if info[0] is None else -1.0] if a.ndim > 1 else 0.0, *MET, name=""
     )
     assert (rows.lacking, rows.hint([])) == (set(), "")
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.bool_, np.int8])
+def test_shaped_rewards_are_the_same_for_goals_of_whole_numbers(dtype: type[np.generic]) -> None:
+    def sparse(achieved: np.ndarray, desired: np.ndarray, info: Any) -> np.ndarray:
+        return -(achieved != desired).any(-1).astype(float)
+
+    shaped = ShapedReward(sparse, -1.0, 0.0, [1.0, 9.0])
+    goals = np.array([[0], [1]]), np.array([[1], [0]])
+    numbers = (goal.astype(np.float32) for goal in goals)
+    assert shaped(*(goal.astype(dtype) for goal in goals)).tolist() == shaped(*numbers).tolist()
