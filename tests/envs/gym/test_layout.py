@@ -74,6 +74,14 @@ def test_a_number_that_float32_cannot_hold_is_named(value: float, got: str) -> N
         Layout(nested(), "goal").flatten(turned)
 
 
+@pytest.mark.filterwarnings("error")
+def test_half_precision_is_checked_like_other_numbers() -> None:
+    layout = Layout(spaces.Box(-np.inf, np.inf, (2,), np.float16), "seen")
+    assert layout.flatten(np.array([1.5, 60_000], np.float16)).tolist() == [1.5, 60_000]
+    with pytest.raises(ValueError, match="^seen 1 must be a finite number, got inf$"):
+        layout.flatten(np.array([0.0, np.inf], np.float16))
+
+
 @pytest.mark.parametrize(
     ("space", "message"),
     [
