@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 from filelock import FileLock, Timeout
 
@@ -160,12 +161,17 @@ class RunFolder:
         return bool(rows) and rows[-1]["epoch"] >= self.recipe().run.epochs
 
     def write_table(self, rows: Sequence[dict[str, float]]) -> None:
-        """Writes the table of metrics to ``metrics.csv``."""
+        """Writes the table of metrics to ``metrics.csv``.
+
+        Raises:
+            ValueError: a value is not a number, as callbacks may have added it.
+        """
         columns = list(dict.fromkeys(name for row in rows for name in row))
+        numbers = [{name: _number(name, value) for name, value in row.items()} for row in rows]
         with written(self.metrics) as part, open(part, "w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, columns, restval="nan")
             writer.writeheader()
-            writer.writerows(rows)
+            writer.writerows(numbers)
 
     @property
     def _parts(self) -> list[Path]:
@@ -193,6 +199,14 @@ class RunFolder:
             return read_table(self.metrics, counts=_COUNTED)
         except FileNotFoundError:
             return []
+
+
+def _number(column: str, value: Any) -> float:
+    """Returns a value of the table as an int or a float, also if it is a number of torch or NumPy."""
+    try:
+        return value if type(value) is int else float(value)
+    except (TypeError, ValueError):
+        raise ValueError(f"column {column!r} of the table must hold numbers, got {value!r}") from None
 
 
 def remember(config: Path, task: str) -> None:

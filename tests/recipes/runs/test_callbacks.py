@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pandas as pd
 import pytest
+import torch
 
 from torchrl_her_recipes import Callback, EarlyStopping, RunView, build, resume, run
 from torchrl_her_recipes.runs.folder import RunFolder
@@ -51,6 +54,28 @@ def test_callbacks_are_called_in_order_and_see_the_run() -> None:
         *("batch 1 240 1", "batch 1 320 1", "epoch 2 320 2", "end 2 320 2"),
     ]
     assert not result.stopped
+
+
+class Column(Callback):
+    """Adds a column to the table."""
+
+    def __init__(self, value: Any) -> None:
+        self.value = value
+
+    def on_epoch(self, run: RunView) -> None:
+        run.rows[-1]["mine"] = self.value
+
+
+@pytest.mark.parametrize("value", [3.5, torch.tensor(3.5), np.float32(3.5)])
+def test_columns_of_callbacks_may_be_numbers_of_any_kind(value: Any, tmp_path: Path) -> None:
+    run(build(small(**SHORT)), tmp_path, callbacks=[Column(value)], progress=False)
+    assert [row["mine"] for row in RunFolder(tmp_path).rows()] == [3.5, 3.5]
+
+
+def test_other_columns_are_refused_before_they_spoil_the_table(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="^column 'mine' of the table must hold numbers, got 'good'$"):
+        run(build(small(**SHORT)), tmp_path, callbacks=[Column("good")], progress=False)
+    assert len(resume(tmp_path, progress=False).rows) == 2
 
 
 def test_all_callbacks_are_called_although_the_first_one_stops_the_run() -> None:
