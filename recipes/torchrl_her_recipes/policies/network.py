@@ -31,13 +31,16 @@ def _action_spec(info: PolicyInfo) -> TensorSpec:
 
 def load_network(
     info: PolicyInfo, options: LearnerConfig, weights: Mapping[str, Tensor]
-) -> TensorDictModuleBase:
+) -> tuple[TensorDictModuleBase, TensorDictModuleBase]:
     """Makes a greedy policy, which reads ``observation`` and ``desired_goal`` and writes ``action``.
 
     Args:
         info: widths of inputs, and actions.
         options: options of the learner, which determine the network.
         weights: ``state_dict()`` of the actor and, if there is one, its normalization.
+
+    Returns:
+        The policy, and the actor with its normalization, which shares its weights with the policy.
 
     Raises:
         ValueError: the weights do not fit the network; this is checked before memory for it is allocated.
@@ -62,7 +65,7 @@ def load_network(
     policy = acting(greedy, player.norm if isinstance(player, NormalizedPolicy) else None)
     if curriculum is not None:
         policy = RelayPolicy(policy, curriculum, in_keys=KEYS)
-    return policy.requires_grad_(False)
+    return policy.requires_grad_(False), player
 
 
 def check_weights(builder: LearnerBuilder, weights: Mapping[str, Tensor]) -> None:

@@ -75,9 +75,9 @@ class Policy(TensorDictModuleBase):
     ) -> None:
         super().__init__()
         self.in_keys, self.out_keys = list(KEYS), ["action"]
-        self.module = load_network(info, recipe.learner, weights)
+        self.module, player = load_network(info, recipe.learner, weights)
         self.info, self.recipe, self.source = info, recipe, source
-        self._weights = dict(weights)
+        self._player = [player]  # in a list, since it is not a further submodule: it shares its weights
 
     @classmethod
     def load(cls, source: str | Path, *, run: int | None = None, best: bool = False) -> Policy:
@@ -254,7 +254,8 @@ class Policy(TensorDictModuleBase):
                 states = evaluate(env, self, max_steps=goal_env(env).max_steps).select(*KEYS).flatten()
             info = write_onnx(self.module, info, self.recipe.to_dict(), path, states=states)
         else:
-            write_policy(path, self._weights, {"info": info.to_dict(), "recipe": self.recipe.to_dict()})
+            described = {"info": info.to_dict(), "recipe": self.recipe.to_dict()}
+            write_policy(path, self._player[0].state_dict(), described)
         if card:
             write_model_card(card_path(path), path.name, info, self.recipe)
 

@@ -23,7 +23,7 @@ def test_the_policy_is_the_learner_s_own_greedy_one(options: dict[str, Any]) -> 
     with torch.no_grad():
         for weight in own.parameters():
             weight.copy_(0.5 * torch.randn_like(weight))
-        loaded = load_network(policy.info, policy.recipe.learner, own.state_dict())
+        loaded, _ = load_network(policy.info, policy.recipe.learner, own.state_dict())
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             wanted = own(seen.clone())["action"]
         with set_exploration_type(ExplorationType.RANDOM):  # it stays greedy

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import sys
 from collections.abc import Callable
 from importlib.util import find_spec
@@ -29,7 +30,7 @@ from torchrl_her_recipes.runs.policy_file import read_policy, write_policy
 
 from ...envs.gym.walk import Walk
 from ..small import Refused, small
-from .tiny import needs_onnx, states, tiny_policy
+from .tiny import LEARNERS, needs_onnx, states, tiny_policy
 
 _GYM = ("fetch_push", "fetch_pick_and_place", "fetch_slide", "shadow_hand_reach")
 _PANDA = ("panda_push", "panda_pick_and_place", "panda_slide", "panda_stack")
@@ -342,6 +343,19 @@ def test_a_policy_that_was_saved_is_the_same(tmp_path: Path) -> None:
     assert (again.info, again.recipe) == (own.info, own.recipe)
     seen = states(own.info, 9)
     assert torch.equal(again(seen.clone())["action"], own(seen)["action"])
+
+
+@pytest.mark.parametrize("options", LEARNERS, ids=lambda options: options["learner"])
+@pytest.mark.parametrize("copied", [False, True])
+def test_weights_that_were_changed_are_saved(options: dict[str, Any], copied: bool, tmp_path: Path) -> None:
+    own, other = tiny_policy(**options), tiny_policy(**options)
+    own = copy.deepcopy(own) if copied else own
+    own.load_state_dict(other.state_dict())
+    own.save(tmp_path / "mine.safetensors")
+    seen = states(own.info, 20)
+    expected = other(seen.clone())["action"]
+    assert torch.equal(own(seen.clone())["action"], expected)
+    assert torch.equal(load_policy(tmp_path / "mine.safetensors")(seen)["action"], expected)
 
 
 def test_options_that_a_file_does_not_know_have_their_defaults(tmp_path: Path) -> None:
