@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
+import gymnasium
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -15,6 +17,7 @@ from torch import Tensor
 from torchrl_her.goals.rewards import EnvReward, Outcome, ask_reward, is_achieved, missed, outcomes
 from torchrl_her_envs.common.goal_env import GoalEnv, goal_env
 from torchrl_her_envs.common.goal_rules import GoalEnds, say_once
+from torchrl_her_envs.registry import GYM, get_task_spec
 from torchrl_her_recipes.components.envs import TaskEnvs, action_bounds
 from torchrl_her_recipes.config.options import AUTO
 from torchrl_her_recipes.config.recipe import Recipe
@@ -23,7 +26,7 @@ from torchrl_her_recipes.config.resolve import TERMINATION, EnvFacts, auto_optio
 _AT_ONCE = 8
 _STEPS = 3_000
 SELDOM = 0.5  # goals change seldom if a smaller share of episodes changes them; Panda: 0.15 to 0.35
-_FACTS: dict[str, EnvFacts] = {}  # cached facts of each task
+_FACTS: dict[str, tuple[object, EnvFacts]] = {}  # cached facts of each task, and the code that they are about
 _SECONDS = 20.0  # seconds after which no further episodes begin
 _FUTURE = 16  # number of later goals of the episode that each transition is tried with
 _DIGITS = 1e-4  # two rewards with at most this relative difference count as equal
@@ -95,8 +98,9 @@ def resolved(recipe: Recipe) -> Recipe:
     needs_stages = auto or (recipe.hindsight.algorithm.curriculum and recipe.curriculum.stages is None)
     if not (auto_options(recipe) or left_open(recipe.task, TERMINATION) or needs_stages):
         return recipe
-    known = f"{recipe.task} {needs_stages} {auto}"
-    if (facts := _FACTS.get(known)) is None:
+    known = f"{get_task_spec(recipe.task.name)} {recipe.task} {needs_stages} {auto}"
+    code, facts = _FACTS.get(known, (None, None))
+    if facts is None or code is not _code_of(recipe.task.name):
         with closing(_watched(TaskEnvs.of(recipe)).make(1, [0])) as env:
             task = goal_env(env)
             facts = EnvFacts(max_steps=task.max_steps, batched=task.batched)
@@ -111,8 +115,16 @@ def resolved(recipe: Recipe) -> Recipe:
         if ends is not None and left_open(recipe.task, TERMINATION):
             facts = replace(facts, ends=ends.found() or "never")
             say_once(ends.line())
-        _FACTS[known] = facts
+        _FACTS[known] = _code_of(recipe.task.name), facts
     return resolve(recipe, facts)
+
+
+def _code_of(task: str) -> object:
+    """Returns the object that makes a user's environment, which a notebook may define again."""
+    if task.startswith(GYM):
+        return gymnasium.registry.get(task.rpartition(":")[2])
+    module, _, name = (task if ":" in task else get_task_spec(task).make).partition(":")
+    return getattr(sys.modules.get(module), name, None)
 
 
 def _watched(envs: TaskEnvs) -> TaskEnvs:

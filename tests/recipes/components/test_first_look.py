@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -135,6 +136,17 @@ def test_a_run_keeps_what_was_found_and_nobody_looks_again(
     with allow_imports():
         build(RunFolder(tmp_path / "run").recipe()).close()
     assert len(said.records) == 1
+
+
+def test_an_environment_that_is_defined_again_is_looked_at_again() -> None:
+    """As by a notebook's cell: the same name stands for another environment."""
+    found = []
+    for stops, steps in ((True, 10), (False, 50)):
+        gymnasium.registry.pop("tests/Again-v0", None)
+        gymnasium.register("tests/Again-v0", partial(Seldom, stops=stops), max_episode_steps=steps)
+        recipe = resolved(make_recipe(task="gym:tests/Again-v0", algo="her"))
+        found.append(((recipe.task.options or {})["termination"], recipe.learner.gamma))
+    assert found == [("reward", 0.9), ("never", 0.96)]
 
 
 def test_what_is_given_and_what_environments_say_themselves_is_not_looked_for(
