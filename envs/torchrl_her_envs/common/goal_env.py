@@ -32,12 +32,14 @@ class GoalEnv(EnvBase):
         max_steps: length of the longest episode.
         missed_reward, achieved_reward: rewards of a missed and of an achieved goal.
         dense_reward: whether missed goals have many different rewards.
+        first_action: number of the first discrete action in the task itself, which is 0 in ``action``.
     """
 
     max_steps: int
     missed_reward: float = -1.0
     achieved_reward: float = 0.0
     dense_reward: bool = False
+    first_action: int = 0
 
     @abstractmethod
     def compute_reward(self, achieved_goal: Tensor, desired_goal: Tensor) -> Tensor:

@@ -439,6 +439,7 @@ class GymGoalEnv(GoalEnv, GymWrapper):
         self.observation_spec = Composite(seen, shape=(n,))
         if isinstance(space, spaces.Discrete):
             self.action_spec = Categorical(n=int(space.n), shape=(n,), dtype=torch.int64)
+            self.first_action = int(space.start)
         else:
             self.action_spec = bounded_actions(*self.action_limits(), n)
         self.reward_spec = Unbounded(shape=(n, 1), dtype=torch.float32)

@@ -33,7 +33,8 @@ class PolicyInfo:
         action_shape: shape of one action: [width], or [] for an integer.
         action_dtype: ``"int64"`` for an integer, otherwise the dtype of the inputs.
         task_dtype: dtype of the task's own actions, which :meth:`Policy.predict` returns.
-        low, high: the least and the greatest action of the task, one number for each entry.
+        low, high: the least and the greatest action of the task, one number for each entry. If actions are
+            integers, those of the policy begin with 0, and only :meth:`Policy.predict` adds ``low``.
         normalize_clip: bound to which normalized inputs are clipped; None if the policy does not normalize.
             The policy itself normalizes: its inputs are the task's raw observations and goals.
         stages: options of each :class:`~torchrl_her.CurriculumStage` of a policy that acts in a
@@ -99,8 +100,8 @@ class PolicyInfo:
             limits = getattr(self, name)
             yield name, len(limits) == entries and all(map(_is_number, limits)), f"have {entries} numbers"
         if self.discrete:
-            fits = self.low == (0,) and 1 <= self.high[0] < _WIDEST
-            yield "high", fits, f"be the last of the actions from 0, below {_WIDEST}"
+            fits = self.low[0] % 1 == 0 and 1 <= self.high[0] - self.low[0] < _WIDEST
+            yield "high", fits, f"be the last of the actions, of which there may be {_WIDEST}"
         for name in ("success", "reached"):
             yield name, _is_number(getattr(self, name)), "be a number"
         yield "stages", self._has_curriculum(), "be those of a curriculum"
@@ -121,6 +122,11 @@ class PolicyInfo:
     def discrete(self) -> bool:
         """Whether actions are single integers."""
         return not self.action_shape
+
+    @property
+    def choices(self) -> int:
+        """Number of actions if they are single integers."""
+        return _choices(self.low, self.high)
 
     @property
     def whole(self) -> bool:
@@ -158,7 +164,7 @@ class PolicyInfo:
             >>> load_policy("hand_v1").info.expects()
             'observation [9], desired_goal [2] and action [3]'
         """
-        return _words(self.widths, self.action_shape, self.high)
+        return _words(self.widths, self.action_shape, self.choices)
 
     def check_plays(self, env: EnvBase, task: str) -> None:
         """Refuses environments whose observations or actions do not fit the policy.
@@ -171,9 +177,10 @@ class PolicyInfo:
             ValueError: the environments do not fit; the message lists the entries of both.
         """
         entries = describe_env(env)
-        compared = ("widths", "action_shape", *(["high"] if self.discrete else []))
-        if any(entries[name] != getattr(self, name) for name in compared):
-            offered = _words(entries["widths"], entries["action_shape"], entries["high"])
+        choices = _choices(entries["low"], entries["high"])
+        differ = any(entries[name] != getattr(self, name) for name in ("widths", "action_shape"))
+        if differ or (self.discrete and choices != self.choices):
+            offered = _words(entries["widths"], entries["action_shape"], choices)
             raise ValueError(
                 f"a policy of {self.task} cannot play {task}: the policy has {self.expects()}, but "
                 f"{task} has {offered}"
@@ -194,7 +201,8 @@ def describe_env(env: EnvBase) -> dict[str, Any]:
     entries = {"widths": {key: int(specs[key].shape[-1]) for key in KEYS}}
     if isinstance(action, Categorical):
         whole = {"action_dtype": "int64", "task_dtype": "int64"}
-        return {**entries, **whole, "action_shape": (), "low": (0.0,), "high": (float(action.space.n - 1),)}
+        first, last = float(task.first_action), float(task.first_action + action.space.n - 1)
+        return {**entries, **whole, "action_shape": (), "low": (first,), "high": (last,)}
     low, high = task.action_limits()
     return {
         **entries,
@@ -210,9 +218,13 @@ def present_versions() -> dict[str, str]:
     return {name: version(name) for name in _PACKAGES}
 
 
-def _words(widths: Mapping[str, int], shape: tuple[int, ...], high: tuple[float, ...]) -> str:
+def _choices(low: tuple[float, ...], high: tuple[float, ...]) -> int:
+    return 0 if math.inf in high or -math.inf in low else int(high[0] - low[0]) + 1
+
+
+def _words(widths: Mapping[str, int], shape: tuple[int, ...], choices: int) -> str:
     inputs = ", ".join(f"{key} [{width}]" for key, width in widths.items())
-    return f"{inputs} and " + (f"action [{shape[0]}]" if shape else f"action of {int(high[0]) + 1} choices")
+    return f"{inputs} and " + (f"action [{shape[0]}]" if shape else f"action of {choices} choices")
 
 
 def _is_whole(value: object, *, least: int) -> bool:

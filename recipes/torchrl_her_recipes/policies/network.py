@@ -25,7 +25,7 @@ _CONSTANTS = ("mean", "std", "limit")  # buffers of an entry's normalization
 
 def _action_spec(info: PolicyInfo) -> TensorSpec:
     if info.discrete:
-        return Categorical(int(info.high[0]) + 1, dtype=torch.int64)
+        return Categorical(info.choices, dtype=torch.int64)
     return Bounded(-1.0, 1.0, shape=info.action_shape, dtype=torch.float32)  # the range that learners use
 
 

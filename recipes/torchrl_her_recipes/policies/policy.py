@@ -201,7 +201,7 @@ class Policy(TensorDictModuleBase):
         batch = inputs["observation"].shape[:-1]
         action = self.module(TensorDict(inputs, batch))["action"].numpy()
         if self.info.discrete:
-            return action, None
+            return action + int(self.info.low[0]), None
         action = np.clip(action, np.array(self.info.low), np.array(self.info.high))  # bounds are float64
         return (np.rint(action) if self.info.whole else action).astype(self.info.task_dtype), None
 

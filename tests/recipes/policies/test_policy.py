@@ -336,6 +336,23 @@ def test_predict_gives_actions_of_the_space(
     assert (np.abs(given.numpy() - taken) <= (0.5 if own.info.whole else 1e-6)).all()
 
 
+def test_predict_counts_discrete_actions_as_the_environment_does(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    actions = spaces.Discrete(2, start=5)
+    own_walk = EnvSpec("tests/OwnWalk-v0", lambda: Walk(actions=actions), max_episode_steps=6)
+    monkeypatch.setitem(gymnasium.registry, own_walk.id, own_walk)
+    plain = {"learner": "dqn", "gamma": 0.9, "normalize": False, "norm": "none"}
+    tiny_policy(task=f"gym:{own_walk.id}", **plain).save(tmp_path / "mine.safetensors")
+    assert "whole numbers from 0 to 1; those of the task begin with 5" in (tmp_path / "mine.md").read_text()
+    own = load_policy(tmp_path / "mine.safetensors")
+    seen = states(own.info, 200)
+    taken, _ = own.predict({key: value.numpy() for key, value in seen.items()})
+    assert set(taken.tolist()) == {5, 6}
+    assert (own(seen)["action"].numpy() + 5 == taken).all()
+    own.info.check_plays(own.envs(1), own.info.task)
+
+
 def test_a_policy_that_was_saved_is_the_same(tmp_path: Path) -> None:
     own = tiny_policy(normalize=True)
     own.save(tmp_path / "mine.safetensors")
