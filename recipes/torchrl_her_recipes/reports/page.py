@@ -30,7 +30,7 @@ _AT_THE_END = ("success", "reached", "distance", "kl", "q_bias")  # metrics whos
 _ABOUT = ("label", "task", "algorithm", "state", "runs", "epoch", "frames", "seconds", "differs")
 
 
-def write_report(study: Study, folder: Path, out: Path) -> Path:
+def write_report(study: Study, folder: str | Path, out: str | Path) -> Path:
     """Writes a page about the results of a study so far, without training anything.
 
     Args:
@@ -46,7 +46,7 @@ def write_report(study: Study, folder: Path, out: Path) -> Path:
         ValueError: the folder has none of the study's runs, or one of them cannot be read.
         OSError: the page cannot be written.
     """
-    return write_page(read_study(study, folder), out)
+    return write_page(read_study(study, Path(folder)), Path(out))
 
 
 def write_page(results: Results, out: Path, *, back: str | None = None) -> Path:

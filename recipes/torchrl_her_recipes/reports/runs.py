@@ -39,7 +39,7 @@ def read_runs(folders: Sequence[Path]) -> Results:
     )
 
 
-def write_runs_report(folders: Sequence[Path], out: Path) -> Path:
+def write_runs_report(folders: Sequence[str | Path], out: str | Path) -> Path:
     """Writes a page about single runs, finished or not, without training anything.
 
     Args:
@@ -53,7 +53,7 @@ def write_runs_report(folders: Sequence[Path], out: Path) -> Path:
         ValueError: a folder has no run, or a run cannot be read.
         OSError: the page cannot be written.
     """
-    return write_page(read_runs(folders), out)
+    return write_page(read_runs([Path(folder) for folder in folders]), Path(out))
 
 
 def _newest_film(folders: Sequence[Path]) -> Picture | None:

@@ -81,7 +81,7 @@ def read_study(study: Study, folder: Path) -> Results:
 
 
 def write_results(
-    study: Study, folder: Path, out: Path, *, command: str | Sequence[str] | None = None
+    study: Study, folder: str | Path, out: str | Path, *, command: str | Sequence[str] | None = None
 ) -> Path:
     """Writes the results of a study to a few small files, which suffice to make its report without the runs.
 
@@ -107,6 +107,7 @@ def write_results(
         ValueError: the folder has none of the study's runs, or one of them cannot be read.
         OSError: the files cannot be written.
     """
+    folder = Path(folder)
     cells = read_combinations(study, folder)
     described = {name: getattr(study, name) for name in ("cases", "for_task", "expect", "published")}
     about = {
@@ -118,7 +119,7 @@ def write_results(
         "vary": study.vary,
         **{name: values for name, values in described.items() if values},
     }
-    return write_files(about, cells, out)
+    return write_files(about, cells, Path(out))
 
 
 def write_files(about: Mapping[str, Any], cells: Sequence[Combination], out: Path) -> Path:

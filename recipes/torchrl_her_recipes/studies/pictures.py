@@ -10,7 +10,7 @@ from torchrl_her_recipes.runs.plots import plot_goals
 from torchrl_her_recipes.studies.seed_batches import Batches
 
 
-def plot_virtual_goals(folder: Path, out: Path) -> None:
+def plot_virtual_goals(folder: str | Path, out: str | Path) -> None:
     """Draws a heat map of a run's virtual goals beside a heat map of their target q*.
 
     Args:
@@ -21,7 +21,7 @@ def plot_virtual_goals(folder: Path, out: Path) -> None:
         ValueError: the folder has no run, the run has no map of goals, or its task names a module that must
             not be imported.
     """
-    runs = Batches(folder)
+    runs = Batches(Path(folder))
     if not runs.homes:
         raise ValueError(f"{folder} is no folder of a run")
     recipe = runs.homes[0].recipe()
@@ -29,7 +29,9 @@ def plot_virtual_goals(folder: Path, out: Path) -> None:
     if goals is None:
         raise ValueError(f"{folder} has no map of goals: {_missing(runs, recipe.task.name)}")
     task, algo = recipe.task.name, recipe.hindsight.algo
-    plot_goals(goals, goal_env(TaskEnvs.of(recipe).make(1, [0])), out, title=f"virtual goals: {task}, {algo}")
+    plot_goals(
+        goals, goal_env(TaskEnvs.of(recipe).make(1, [0])), Path(out), title=f"virtual goals: {task}, {algo}"
+    )
 
 
 def _missing(runs: Batches, task: str) -> str:

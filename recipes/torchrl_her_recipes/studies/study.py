@@ -45,7 +45,7 @@ class StudyResult:
     interrupted: bool = False
 
 
-def plan_study(study: Study | Mapping[str, Recipe], folder: Path) -> Plan:
+def plan_study(study: Study | Mapping[str, Recipe], folder: str | Path) -> Plan:
     """Plans the jobs of a study or of a sweep.
 
     Args:
@@ -56,6 +56,7 @@ def plan_study(study: Study | Mapping[str, Recipe], folder: Path) -> Plan:
     Raises:
         ValueError: the folder has a run with the same name and other options.
     """
+    folder = Path(folder)
     if isinstance(study, Study):
         cells = ((label, resolved(recipe)) for label, recipe in study.cells())
         jobs = [job for label, recipe in cells for job in plan_batches(label, recipe, folder)]
@@ -66,7 +67,7 @@ def plan_study(study: Study | Mapping[str, Recipe], folder: Path) -> Plan:
 
 def run_study(
     study: Study | Mapping[str, Recipe],
-    folder: Path,
+    folder: str | Path,
     *,
     workers: Workers | None = None,
     progress: bool = True,
@@ -86,7 +87,7 @@ def run_study(
             folder, or a task names a module that must not be imported.
         KeyboardInterrupt: Ctrl-C was pressed a second time.
     """
-    runs = dict(study.cells()) if isinstance(study, Study) else study
+    folder, runs = Path(folder), dict(study.cells()) if isinstance(study, Study) else study
     for recipe in runs.values():
         check_permitted(recipe.task.name)
     with closing(workers or LocalWorkers()) as workers:
@@ -110,7 +111,7 @@ def run_study(
     )
 
 
-def unfinished_sweep(runs: Mapping[str, Recipe], folders: Path) -> Path | None:
+def unfinished_sweep(runs: Mapping[str, Recipe], folders: str | Path) -> Path | None:
     """Finds the newest folder of an unfinished sweep with exactly the given runs; None if there is none.
 
     Args:
@@ -120,7 +121,7 @@ def unfinished_sweep(runs: Mapping[str, Recipe], folders: Path) -> Path | None:
     Example:
         >>> unfinished_sweep({}, Path("nowhere"))
     """
-    for note in sorted(folders.glob(f"*/{_NOTE}"), reverse=True):
+    for note in sorted(Path(folders).glob(f"*/{_NOTE}"), reverse=True):
         same = note.read_bytes() == _note(runs).encode()
         if same and not all(RunFolder(note.parent / label).is_done for label in runs):
             return note.parent

@@ -34,7 +34,7 @@ def test_tasks_without_a_screen_and_with_odd_names_have_a_page(tmp_path: Path) -
     study = Study(name="odd", recipe=RECIPE, vary={"task": tasks, "algo": ALGORITHMS})
     for label, _ in study.cells():
         write_run(tmp_path / "runs", study, label, [0.1, 0.3, 0.4, 0.9])
-    page = write_report(study, tmp_path / "runs", tmp_path / "report").read_text()
+    page = write_report(study, str(tmp_path / "runs"), str(tmp_path / "report")).read_text()
     assert all(task in page for task in tasks)
     names = {path.name for path in (tmp_path / "report" / "figures").iterdir()}
     assert {"success_treasure_hunt.png", "success_gym_torchrl_her_HandThrow-v1.png"} <= names

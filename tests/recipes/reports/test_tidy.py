@@ -89,7 +89,9 @@ def test_what_made_them_is_written_down(tmp_path: Path) -> None:
     write_run(tmp_path / "runs", STUDY, "hand_v2_her", [0.5])
     home = tmp_path / "runs" / "hand_v2_her"
     (home / "run.json").write_text('{"versions": {"torch": "2.14.1"}}')
-    about = yaml.safe_load((write_results(STUDY, tmp_path / "runs", tmp_path) / "about.yaml").read_text())
+    about = yaml.safe_load(
+        (write_results(STUDY, str(tmp_path / "runs"), str(tmp_path)) / "about.yaml").read_text()
+    )
     assert (about["study"], about["command"]) == ("bias", "torchrl-her study bias")
     assert about["versions"] == {"torch": "2.14.1"}
     assert about["recipe"] == STUDY.recipe

@@ -140,7 +140,7 @@ def test_the_guide_s_study_is_planned_as_it_says(
 
 def test_a_combination_that_was_cut_short_goes_on(tmp_path: Path) -> None:
     short = Study(name="cut", recipe={**SMALL, "epochs": 1}, vary={"algo": ["her"]})
-    run_study(short, tmp_path, workers=Here(), progress=False)
+    run_study(short, str(tmp_path), workers=Here(), progress=False)
     (home,) = Batches(tmp_path / "her").homes
     home.config.write_text(home.config.read_text().replace("epochs: 1", "epochs: 2"))
     assert not Batches(tmp_path / "her").is_done
