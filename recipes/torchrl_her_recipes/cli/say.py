@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import shlex
 import statistics
 import sys
 from collections.abc import Sequence
@@ -11,8 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import click
 from tqdm import tqdm
-
-from torchrl_her_recipes.config.imports import imported_modules, needs_permission
 
 if TYPE_CHECKING:  # not at runtime, since this import would import torch
     from torchrl_her_recipes.studies.study import StudyResult
@@ -89,18 +86,6 @@ def success_line(successes: Sequence[float]) -> str:
     below = sum(success < _HARDLY for success in successes)
     failed = f"; {below} of {len(successes)} runs below {_HARDLY:.0%}" if below else ""
     return f"median success {median:.0%}, worst {worst:.0%}{failed}"
-
-
-def command_line(*words: object, task: str) -> str:
-    """Returns a command about a task, quoted for a shell, with the imports and the permission that it needs.
-
-    Example:
-        >>> command_line("train", "--resume", "my runs/a", task="package.envs:make_env")
-        "torchrl-her train --resume 'my runs/a' --allow-import"
-    """
-    imports = [word for module in imported_modules() for word in ("--import", module)]
-    allowed = ["--allow-import"] if needs_permission(task) else []
-    return shlex.join(["torchrl-her", *imports, *map(str, words), *allowed])
 
 
 def file_name(task: str) -> str:

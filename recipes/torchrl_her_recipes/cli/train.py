@@ -9,7 +9,7 @@ import click
 
 import torchrl_her_recipes as recipes  # imports torch only when one of its names is used
 from torchrl_her_recipes.cli.overrides import single
-from torchrl_her_recipes.cli.say import INTERRUPTED, command_line, exit_code, say_result, success_line
+from torchrl_her_recipes.cli.say import INTERRUPTED, exit_code, say_result, success_line
 from torchrl_her_recipes.cli.train_options import (
     OptionsCommand,
     complete,
@@ -17,6 +17,7 @@ from torchrl_her_recipes.cli.train_options import (
     requests,
     with_folder,
 )
+from torchrl_her_recipes.config.imports import command_line
 from torchrl_her_recipes.config.plain_files import dump_yaml
 from torchrl_her_recipes.config.recipe import Recipe, check_extending
 from torchrl_her_recipes.config.resolve import SHAPING, auto_options, left_open

@@ -11,8 +11,9 @@ from tqdm import tqdm
 
 import torchrl_her_recipes as recipes  # imports torch only when one of its names is used
 from torchrl_her_recipes.cli.overrides import single
-from torchrl_her_recipes.cli.say import command_line, exit_code, fail
+from torchrl_her_recipes.cli.say import exit_code, fail
 from torchrl_her_recipes.cli.train_options import complete, folder_option, label, with_folder
+from torchrl_her_recipes.config.imports import command_line
 from torchrl_her_recipes.config.presets import load_preset
 from torchrl_her_recipes.config.recipe import make_recipe
 from torchrl_her_recipes.config.searches.search import PRUNERS, SAMPLERS, Search

@@ -8,6 +8,7 @@ the folder of a run, a policy, a preset or a study may come from somebody else.
 
 from __future__ import annotations
 
+import shlex
 import sys
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
@@ -81,6 +82,18 @@ def needs_permission(task: str, named: Collection[str] = ()) -> bool:
     """
     module, known = foreign_module(task), (*named, *_imported)
     return bool(module) and not any(f"{module}.".startswith(f"{name}.") for name in known)
+
+
+def command_line(*words: object, task: str) -> str:
+    """Returns a command about a task, quoted for a shell, with the imports and the permission that it needs.
+
+    Example:
+        >>> command_line("train", "--resume", "my runs/a", task="package.envs:make_env")
+        "torchrl-her train --resume 'my runs/a' --allow-import"
+    """
+    imports = [word for module in imported_modules() for word in ("--import", module)]
+    allowed = ["--allow-import"] if needs_permission(task) else []
+    return shlex.join(["torchrl-her", *imports, *map(str, words), *allowed])
 
 
 def permit_task(task: str) -> None:

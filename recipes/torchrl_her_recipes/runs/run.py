@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 import statistics
 import time
 import warnings
@@ -21,6 +20,7 @@ from torchrl_her_recipes.components.assembly import build, eval_seeds
 from torchrl_her_recipes.components.components import Components
 from torchrl_her_recipes.components.envs import TaskEnvs
 from torchrl_her_recipes.config.groups import RunConfig
+from torchrl_her_recipes.config.imports import command_line
 from torchrl_her_recipes.config.loggers import check_installed
 from torchrl_her_recipes.config.plain_files import naming
 from torchrl_her_recipes.config.recipe import Recipe
@@ -396,10 +396,10 @@ class _Run:
             expected = [home.curves, home.video] if self.recipe.run.pictures else []
             missing = [path.name for path in (*expected, home.policy) if not path.is_file()]
             why = (error.strerror or str(error)).lower()
+            resuming = command_line("train", "--resume", home.path, task=self.recipe.task.name)
             raise OSError(
                 f"cannot write {error.filename or ' or '.join(missing)}: {why}; "
-                f"{', '.join(missing)} will be written by: torchrl-her train --resume "
-                f"{shlex.quote(str(home.path))}"
+                f"{', '.join(missing)} will be written by: {resuming}"
             ) from error
 
     def _draw(self, goals: GoalMap | None, home: RunFolder) -> None:
