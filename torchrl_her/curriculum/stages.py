@@ -45,8 +45,8 @@ class CurriculumStage:
 
     Raises:
         ValueError: a list is empty, an index is negative or repeated, the desired goal shares an index with
-            another list, the goals differ in width, a constant goal is not finite, or the threshold is not
-            positive.
+            another list, the goals differ in width, a constant goal is not finite, the threshold is not
+            positive, or a flag is no bool.
 
     Example:
         >>> CurriculumStage(
@@ -70,6 +70,11 @@ class CurriculumStage:
             raise ValueError(
                 f"stage {self.name!r}: threshold must be positive and finite, got {self.threshold}"
             )
+        for key in ("terminates", "instructive"):
+            if not isinstance(getattr(self, key), bool):
+                raise ValueError(
+                    f"stage {self.name!r}: {key} must be true or false, got {getattr(self, key)!r}"
+                )
         object.__setattr__(self, "constant_goal", tuple(map(float, self.constant_goal)))
         if not all(map(math.isfinite, self.constant_goal)):
             raise ValueError(f"stage {self.name!r}: constant_goal must be finite, got {self.constant_goal}")

@@ -138,7 +138,7 @@ class Exploration(TensorDictModuleBase):
         """Replaces greedy actions by exploring ones, unless exploration is switched off.
 
         Raises:
-            ValueError: the batch cannot be cut into R equal blocks, or discrete actions are not integers.
+            ValueError: the batch cannot be cut into R equal blocks.
         """
         if exploration_type() not in (ExplorationType.RANDOM, None):
             return tensordict
@@ -240,7 +240,8 @@ class DecayingEpsilonGreedy(Exploration):
             ValueError: as in :class:`~torchrl_her.modules.Exploration`, or actions are one-hot.
         """
         action = tensordict.get(self.in_keys[0])
-        if action.shape[tensordict.ndim :] == (self.actions,) and self.actions > 1:
+        one_hot = self.actions > 1 and action.shape[tensordict.ndim :] == (self.actions,)
+        if one_hot or action.is_floating_point() or action.dtype is torch.bool:
             raise ValueError(
                 f"actions must be whole numbers (categorical), got {action.dtype} of shape "
                 f"{list(action.shape)} (one-hot?)"
@@ -248,6 +249,4 @@ class DecayingEpsilonGreedy(Exploration):
         return super().forward(tensordict)
 
     def _explore(self, greedy: Tensor, epsilon: Tensor, generator: torch.Generator | None) -> Tensor:
-        if greedy.is_floating_point() or greedy.dtype is torch.bool:
-            raise ValueError(f"actions must be whole numbers (categorical), got {greedy.dtype} (one-hot?)")
         return explore_actions(greedy, self.actions, epsilon.to(torch.float32), generator=generator)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from torchrl_her_recipes.components.assembly import build
-from torchrl_her_recipes.config.imports import import_modules, imported_modules, permit_task
+from torchrl_her_recipes.config.imports import foreign_module, import_modules, imported_modules, permit_task
 from torchrl_her_recipes.config.plain_files import LARGEST_TABLE, read_text
 from torchrl_her_recipes.config.recipe import Recipe
 from torchrl_her_recipes.config.values import load_name
@@ -54,11 +54,17 @@ class Job:
         """Makes a job from the values of :meth:`to_plain`, and imports its modules.
 
         Raises:
-            ValueError: a module cannot be imported, or the recipe names a task or a choice that is unknown.
+            ValueError: a module cannot be imported, the recipe names a task or a choice that is unknown, or
+                the task's function is in the program that made the job and in no module.
         """
         import_modules(values["modules"])
         recipe = Recipe.from_dict(values["recipe"])
-        permit_task(recipe.task.name)  # the process that started the study has checked the permission
+        if foreign_module(task := recipe.task.name) == "__main__":
+            raise ValueError(
+                f"task={task} is made in the script or notebook that started the study, which other "
+                "processes cannot import: put it in a module of its own"
+            )
+        permit_task(task)  # the process that started the study has checked the permission
         around = {name: values[name] for name in ("around", "options")}
         return cls(label=values["label"], recipe=recipe, folder=Path(values["folder"]), **around)
 

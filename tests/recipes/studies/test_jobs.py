@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from torchrl_her_recipes import Callback, EarlyStopping
+from torchrl_her_recipes import Callback, EarlyStopping, make_recipe
 from torchrl_her_recipes.runs.folder import RunFolder
 from torchrl_her_recipes.studies import jobs
 from torchrl_her_recipes.studies.jobs import (
@@ -151,3 +151,9 @@ def test_what_surrounds_a_run_travels_with_its_job_and_gives_it_callbacks(job: J
     assert run_job(own) == Outcome()
     assert read_progress(job.folder).epochs == 1  # of two
     assert told.exists()
+
+
+def test_a_task_of_the_program_itself_is_named(job: Job) -> None:
+    own = replace(job, recipe=make_recipe(task="__main__:Point"))
+    with pytest.raises(ValueError, match="task=__main__:Point is made in the script or notebook"):
+        Job.from_plain(own.to_plain())

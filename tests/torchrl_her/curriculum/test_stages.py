@@ -93,6 +93,7 @@ def test_a_stage_keeps_what_it_is_given() -> None:
         ({"threshold": -1.0}, r"got -1.0"),
         ({"threshold": math.nan}, r"got nan"),
         ({"threshold": math.inf}, r"got inf"),
+        ({"terminates": 3}, r"stage 'one': terminates must be true or false, got 3"),
         ({"observation": []}, r"stage 'one': observation must not be empty"),
         ({"desired_goal": [-1]}, r"stage 'one': desired_goal must have indices of at least 0, got \(-1,\)"),
         ({"observation": [0, 1, 0]}, r"stage 'one': observation must not repeat an index, got \(0, 1, 0\)"),
