@@ -104,9 +104,8 @@ class LocalWorkers:
 
 def _cores() -> int:
     """Returns the number of cores that this process may use, which taskset or a job scheduler can limit."""
-    if sys.platform == "linux":
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    affinity = getattr(os, "sched_getaffinity", None)  # macOS has none
+    return len(affinity(0)) if affinity else os.cpu_count() or 1
 
 
 class _Worker:
