@@ -113,6 +113,10 @@ def boards() -> dict[str, list[Curves]]:
         ],
         "FetchSlide": [
             ours("TD3 of FetchSlide's stages and symmetries", "`preset=fetch_slide`, seeds 0, 100 and 101"),
+            ours(
+                "FetchSlide to 500,000 steps on an AMD EPYC",
+                "`preset=fetch_slide epochs=100`, seed 100 on another machine",
+            ),
             ours("default agent on FetchSlide", "default agent, `epsilon_decay=0.99`"),
         ],
         "PandaPush": defaults("PandaPush"),
