@@ -237,7 +237,7 @@ class DecayingEpsilonGreedy(Exploration):
         """Replaces greedy actions by exploring ones, unless exploration is switched off.
 
         Raises:
-            ValueError: as in :class:`~torchrl_her.modules.Exploration`, or actions are one-hot.
+            ValueError: as in :class:`~torchrl_her.modules.Exploration`, or actions are not whole numbers.
         """
         action = tensordict.get(self.in_keys[0])
         one_hot = self.actions > 1 and action.shape[tensordict.ndim :] == (self.actions,)

@@ -164,7 +164,7 @@ class PolicyInfo:
             >>> load_policy("hand_v1").info.expects()
             'observation [9], desired_goal [2] and action [3]'
         """
-        return _words(self.widths, self.action_shape, self.choices)
+        return _words(self.widths, self.action_shape, self.low, self.high)
 
     def check_plays(self, env: EnvBase, task: str) -> None:
         """Refuses environments whose observations or actions do not fit the policy.
@@ -177,10 +177,10 @@ class PolicyInfo:
             ValueError: the environments do not fit; the message lists the entries of both.
         """
         entries = describe_env(env)
-        choices = _choices(entries["low"], entries["high"])
+        limits = entries["low"], entries["high"]
         differ = any(entries[name] != getattr(self, name) for name in ("widths", "action_shape"))
-        if differ or (self.discrete and choices != self.choices):
-            offered = _words(entries["widths"], entries["action_shape"], choices)
+        if differ or (self.discrete and _choices(*limits) != self.choices):
+            offered = _words(entries["widths"], entries["action_shape"], *limits)
             raise ValueError(
                 f"a policy of {self.task} cannot play {task}: the policy has {self.expects()}, but "
                 f"{task} has {offered}"
@@ -219,12 +219,16 @@ def present_versions() -> dict[str, str]:
 
 
 def _choices(low: tuple[float, ...], high: tuple[float, ...]) -> int:
-    return 0 if math.inf in high or -math.inf in low else int(high[0] - low[0]) + 1
+    return int(high[0] - low[0]) + 1
 
 
-def _words(widths: Mapping[str, int], shape: tuple[int, ...], choices: int) -> str:
+def _words(
+    widths: Mapping[str, int], shape: tuple[int, ...], low: tuple[float, ...], high: tuple[float, ...]
+) -> str:
     inputs = ", ".join(f"{key} [{width}]" for key, width in widths.items())
-    return f"{inputs} and " + (f"action [{shape[0]}]" if shape else f"action of {choices} choices")
+    return f"{inputs} and " + (
+        f"action [{shape[0]}]" if shape else f"action of {_choices(low, high)} choices"
+    )
 
 
 def _is_whole(value: object, *, least: int) -> bool:
