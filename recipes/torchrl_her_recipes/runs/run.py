@@ -289,6 +289,8 @@ class _Run:
                 if not saved:
                     self.save(home)
                     self.save_best(home)
+                if interrupted and recipe.run.pictures:
+                    display.say("the run is saved; its pictures are drawn, unless Ctrl-C is pressed again")
                 self.finish(home)
             for hook in hooks:
                 hook.on_end(view)

@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 from shutil import copytree
 from typing import Any
+from unittest.mock import Mock
 
 import pandas as pd
 import pytest
@@ -18,6 +19,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from torchrl_her import load_checkpoint, save_checkpoint
 from torchrl_her_recipes import Callback, Components, EarlyStopping, Recipe, RunView, build, cli, resume, run
+from torchrl_her_recipes.runs import run as run_module
 from torchrl_her_recipes.runs import state as run_state
 from torchrl_her_recipes.runs.folder import RunFolder
 
@@ -178,6 +180,20 @@ def test_ctrl_c_saves_what_there_is(tmp_path: Path) -> None:
     assert saved["trainer"]["frames"] == 15 * 80
     assert saved["trainer"]["measured"]["loss_value"].shape == (12, 1)
     assert (tmp_path / "run" / "curves.png").exists()
+
+
+def test_a_second_ctrl_c_skips_the_pictures_and_loses_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recipe = small(epochs=2, pictures=True)
+    run(build(recipe), tmp_path / "whole", progress=False)
+    with monkeypatch.context() as patch:
+        patch.setattr(run_module, "film_policy", Mock(side_effect=KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            run(press_ctrl_c(build(recipe), 8), tmp_path / "part")
+    assert "its pictures are drawn, unless Ctrl-C is pressed again" in capsys.readouterr().out
+    assert not resume(tmp_path / "part", progress=False).interrupted
+    assert_same_runs(tmp_path / "whole", tmp_path / "part")
 
 
 def test_an_environment_that_cannot_be_saved_goes_on_with_new_episodes(
