@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from torchrl_her_recipes import load_preset, make_recipe
@@ -104,3 +105,30 @@ def test_a_preset_cannot_begin_with_itself(
     Path("b.yaml").write_text("preset: a.yaml\n")
     with pytest.raises(ValueError, match=r"the preset 'a\.yaml' extends itself"):
         load_preset("a.yaml")
+
+
+def test_panda_stack_does_the_same_in_its_mirror_image() -> None:
+    env = pytest.importorskip("panda_gym.envs").PandaStackEnv()
+    symmetry, draws = read_yaml(find_file("symmetry", "panda_stack")), np.random.default_rng(0)
+    positions, speeds, spins = draws.uniform(-1, 1, [3, 2, 3])  # of two blocks in the air
+    turns, goals, actions = (draws.uniform(-1, 1, shape) for shape in ([2, 4], [2, 3], [3, 4]))
+
+    def last_state(position: list[int], turn: list[int], action: list[int]) -> np.ndarray:
+        """Returns the state after three steps, from a start and actions with these signs."""
+        env.reset(seed=0)
+        env.task.goal = (goals * position).ravel()
+        for block, name in enumerate(("object1", "object2")):
+            env.sim.set_base_pose(name, positions[block] * position + [0, 0, 9], turns[block] * [*turn, 1])
+            velocity = speeds[block] * position, spins[block] * turn
+            env.sim.physics_client.resetBaseVelocity(env.sim._bodies_idx[name], *velocity)
+        for each in actions * action:
+            seen = env.step(each)[0]
+        return np.append(seen["observation"], seen["desired_goal"])
+
+    state = last_state([1, 1, 1], [1, 1, 1], [1, 1, 1, 1])
+    mirrored = last_state([1, -1, 1], [-1, 1, -1], [1, -1, 1, 1])
+    assert symmetry["mirror_action"] == [1]
+    assert set(symmetry["mirror"].values()) == {0}
+    assert set(symmetry["mirror"]) == set(np.flatnonzero(np.abs(state - mirrored) > 0.05))
+    sides = [1 - 2 * (column in symmetry["mirror"]) for column in range(37)]
+    np.testing.assert_allclose(mirrored * sides, state, atol=0.02)
