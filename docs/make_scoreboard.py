@@ -121,6 +121,9 @@ def boards() -> dict[str, list[Curves]]:
         ],
         "PandaPush": defaults("PandaPush"),
         "PandaPickAndPlace": defaults("PandaPickAndPlace"),
+        "PandaStack": [
+            ours("two blocks on PandaStack in six stages", "`preset=panda_stack`, seeds 100 and 101")
+        ],
     }
 
 
